@@ -1,6 +1,7 @@
 """Level starts with one antenna, and a heading from another source or an unknown heading."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -9,10 +10,13 @@ from scipy.stats import chi2
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.estimation.starts import level_start, still_start
-from quad_gym.records import joint_covariance
+from quad_gym.kernels.filter.starts import _set_magnetic_heading
+from quad_gym.records import Outcome, joint_covariance
+from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import fly
 from tests.filter_states import set_at_rest
 from tests.level_flights import GRAVITY, MAGNETIC, R_IG, LevelFlight
+from tests.unit.compiled import Compiled
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
 DRAWS = 300
@@ -289,3 +293,54 @@ def test_suites_without_the_sensor_are_refused():
     ):
         with pytest.raises(ValueError, match=sensor):
             kf.update(**given)
+
+
+class Field(NamedTuple):
+    """Inputs of a heading from a magnetometer."""
+
+    field_I: Any
+    field_B: Any
+    field_sigma: Any
+    iron: int
+    declination: int
+
+
+def heading_of_field(s, option):
+    s.outcome = _set_magnetic_heading(s, Field(s.field_I, s.field_B, s.field_sigma, 0, 3))
+
+
+vectors = dict.fromkeys(("field_I", "field_B"), (3,))
+found = {"heading": (), "heading_sigma": (), "heading_of_tilt": (2,), "heading_of_slow": (4,)}
+headings = Compiled(heading_of_field, T=(3, 3), field_sigma=(), outcome=(), **vectors, **found)
+
+
+def heading_from(field_I, e, field_B=None):
+    """Return the heading, and other results, of a vehicle with known tilt at Euler angles e."""
+    field_B = euler_to_dcm(e) @ field_I if field_B is None else field_B
+    given = {"T": euler_to_dcm([e[0], e[1], 0.0]), "field_I": field_I, "field_B": field_B}
+    got = headings.on_floats(**{k: [v] for k, v in given.items()}, field_sigma=[0.02])
+    return {name: value[0] for name, value in got.items()}
+
+
+@pytest.mark.parametrize("field_I", [(0.2, 0.5, -0.8), (-0.6, 0.1, 0.5), (0.3, -0.4, 0.0)])
+def test_heading_of_a_field_and_its_derivatives_have_the_closed_form(field_I):
+    field_I, e = np.array(field_I), np.array([0.3, -0.4, 2.0])
+    got = heading_from(field_I, e)
+    assert got["outcome"] == Outcome.OK
+    assert math.remainder(got["heading"] - e[2], math.tau) == pytest.approx(0.0, abs=1e-14)
+    assert got["heading_sigma"] == pytest.approx(0.02 / np.hypot(*field_I[:2]), rel=1e-14)
+    field_B, h = euler_to_dcm(e) @ field_I, 1e-5
+    for i, d in enumerate(h * np.eye(3)):  # the error of the heading is truth minus estimate
+        ends = [heading_from(field_I, e, field_B + sign * d)["heading"] for sign in (1, -1)]
+        slope = math.remainder(ends[0] - ends[1], math.tau) / (2.0 * h)
+        assert got["heading_of_slow"][i] == pytest.approx(-slope, abs=1e-8)
+    assert abs(got["heading_of_slow"][3]) == pytest.approx(1.0, abs=1e-14)  # declination
+
+
+@pytest.mark.parametrize("azimuth", [0.3, 1.5])
+@pytest.mark.parametrize("share", [0.9e-3, 1.1e-3])
+def test_almost_vertical_field_gives_no_heading(azimuth, share):
+    """The limit is a level part of a thousandth of the strength."""
+    level = 0.4 * share * np.array([np.cos(azimuth), np.sin(azimuth)])
+    outcome = heading_from(np.append(level, -0.4), np.array([0.1, 0.2, 0.3]))["outcome"]
+    assert outcome == (Outcome.OK if share > 1e-3 else Outcome.OUT_OF_RANGE)

@@ -7,10 +7,14 @@ import pytest
 
 import quad_gym
 from quad_gym import FlightBatch, GroundParams, TaskParams, WorldParams, vehicle_params
+from quad_gym.kernels.numbers.lanes import select
+from quad_gym.kernels.numbers.linalg import load3
+from quad_gym.kernels.vehicle.ground import _can_hold
 from quad_gym.records import Control, Ending, Source
 from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import put
 from tests.field_flights import nees
+from tests.unit.compiled import Compiled
 
 GRAVITY, TICK, FLOOR = 9.8, 1.0 / 200.0, -0.1
 CALM = vehicle_params("lab").replace(drag_coefficient=0.0)
@@ -301,3 +305,40 @@ def test_filter_is_consistent_while_vehicle_is_on_the_ground(suite):
         flights.step(np.full((256, 4), -0.3))
     assert (flights.record("footing") == 4.0).all()
     assert 10.0 < nees(flights).mean() < 15.0 + 5.0 * 0.34
+
+
+def hold(f, option):
+    f.holds = select(_can_hold(f, load3(f.F), load3(f.T), f.friction), 1.0, 0.0)
+
+
+holding = Compiled(hold, ground_arm=(4, 3), F=(3,), T=(3,), friction=(), holds=())
+
+
+@pytest.mark.parametrize("instance", ["on_floats", "on_lanes"])
+@pytest.mark.parametrize("friction", [0.4, 10.0])
+def test_vehicle_rests_if_its_feet_can_push_as_needed(instance, friction):
+    """The feet share a horizontal impulse; normal ones, by least squares, give the other torque."""
+    rng = np.random.default_rng(21)
+    feet = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) * [0.2, 0.1, 0.0]
+    feet += [0.02, -0.01, -0.15]  # from the center of mass
+    F, T = np.concatenate([rng.normal(size=(400, 2)), np.ones((400, 1))], axis=1), []
+    F[:, :2] *= 0.3
+    expected, sure = [], []
+    for f in F:
+        aside = np.append(f[:2], 0.0) / 4
+        pushed = np.cross(feet, aside).sum(axis=0)
+        torque = pushed + np.append(rng.normal(size=2) * [0.1, 0.2], 0.0) * 0.7
+        torque[:2] += np.cross(feet, [0.0, 0.0, 0.25]).sum(axis=0)[:2]
+        ups = np.cross(feet, [0.0, 0.0, 1.0])[:, :2]
+        A, b = np.vstack([np.ones(4), ups.T]), np.append(f[2], (torque - pushed)[:2])
+        least = np.linalg.lstsq(A, b, rcond=None)[0].min()
+        margin = friction * f[2] - np.hypot(f[0], f[1])
+        T.append(torque)
+        expected.append(least >= 0.0 and margin >= 0.0)
+        sure.append(min(abs(least), abs(margin)) > 1e-9)
+    arms = np.broadcast_to(feet, (400, 4, 3))
+    given = {"ground_arm": arms, "F": F, "T": T, "friction": np.full(400, friction)}
+    got = getattr(holding, instance)(**given)["holds"]
+    assert all(sure)
+    assert 40 < sum(expected) < 360
+    np.testing.assert_array_equal(got, expected)

@@ -1,5 +1,7 @@
 """The Runge-Kutta integration of a flight: its order, conservation laws, closed forms and SciPy."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -7,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.kernels.entries import integrate_flight
+from quad_gym.kernels.vehicle.air import integrate_in_air
 from quad_gym.kernels.vehicle.dynamics import integrate
 from quad_gym.packing import params_record
 from quad_gym.records import FLIGHT
@@ -134,3 +137,36 @@ def test_lanes_and_floats_integrate_eight_flights_equally():
     lanes = lanes_and_floats.on_lanes(20, **flights)
     for name in STATE:
         np.testing.assert_allclose(plain[name], lanes[name], rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+class Air(NamedTuple):
+    """Settings of air with linear drag alone."""
+
+    substeps: int
+    linear_drag: bool = True
+    ground_effect: bool = False
+
+
+AIR = dict.fromkeys(("wind", "linear_drag_B", "rotor_drag_B"), (3,))
+AIR |= {"ground_height": (), "rotor_radius": (), "rotor_positions_B": (4, 3)}
+in_air = Compiled(
+    lambda f, n: integrate_in_air(f, f, Air(n, True, False)), **STATE, **PARAMS, **INPUTS, **AIR
+)
+
+
+@pytest.mark.parametrize("instance", ["on_floats", "on_lanes"])
+def test_velocity_approaches_the_wind_exponentially(instance):
+    fields = eight_flights()
+    fields["w"], fields["rotor_speeds"], fields["voltages"] = (np.zeros((8, n)) for n in (3, 4, 4))
+    fields["half_drag"] = np.zeros(8)
+    fields["wind"] = np.random.default_rng(31).normal(0.0, 5.0, (8, 3))
+    fields["linear_drag_B"], fields["dt"] = np.full((8, 3), 0.7), np.full(8, 1.5)
+    got = getattr(in_air, instance)(200, **fields)
+    rate, mass = 0.7 / fields["mass"][:, np.newaxis], fields["mass"][:, np.newaxis]
+    weight = fields["disturbance"] / mass - [0.0, 0.0, 1.0] * fields["gravity"][:, np.newaxis]
+    last = fields["wind"] + weight / rate
+    decay = np.exp(-1.5 * rate)
+    v = last + (fields["v"] - last) * decay
+    np.testing.assert_allclose(got["v"], v, rtol=0.0, atol=1e-8)
+    r = fields["r"] + last * 1.5 + (fields["v"] - last) * (1.0 - decay) / rate
+    np.testing.assert_allclose(got["r"], r, rtol=0.0, atol=1e-8)

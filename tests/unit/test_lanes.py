@@ -17,7 +17,9 @@ from quad_gym.kernels.numbers.lanes import (
     rotate_left,
     round_to_even,
     select,
+    zero_like,
 )
+from quad_gym.kernels.numbers.linalg import load3, load33, store
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 
@@ -226,3 +228,28 @@ def test_invalid_value_in_one_lane_leaves_other_lanes_unchanged(bad, where, valu
         clean = compiled.on_lanes(x=x, y=y)["out"]
         corrupt = compiled.on_lanes(x=corrupt_x, y=corrupt_y)["out"]
         assert clean[others].tobytes() == corrupt[others].tobytes()
+
+
+def zeros(f, option):
+    f.number, f.integer = zero_like(f.x), zero_like(option) / 2
+    store(f.three, zero_like((f.x, 1.0 + f.x, 2.0)))
+    m = zero_like(load33(f.m))
+    for i in range(3):
+        store(f.m[i], m[i])
+    store(f.v, zero_like(load3(f.v)))
+
+
+threes = {"three": (3,), "v": (3,), "m": (3, 3)}
+zeros_on = Compiled(zeros, x=(), number=(), integer=(), **threes)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+def test_zero_of_a_number_vector_or_matrix_is_zero_where_it_is_not_nan(instance):
+    x, v = np.array([2.0, -1e300, math.nan]), np.array([[1.0, math.nan, -3.0]] * 3)
+    m = v[:, np.newaxis] * [[1.0], [2.0], [-3.0]]
+    got = getattr(zeros_on, instance)(3, x=x, v=v, m=m)
+    np.testing.assert_array_equal(got["number"], [0.0, 0.0, math.nan])
+    np.testing.assert_array_equal(got["integer"], 0.0)
+    np.testing.assert_array_equal(got["three"], [[0, 0, 0], [0, 0, 0], [math.nan, math.nan, 0]])
+    np.testing.assert_array_equal(got["v"], 0.0 * v)
+    np.testing.assert_array_equal(got["m"], 0.0 * m)

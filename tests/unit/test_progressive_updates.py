@@ -7,12 +7,14 @@ from scipy import stats
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import SensorLoss
+from quad_gym.kernels.filter.progressive import MOST_STEPS, factor_of
 from quad_gym.records import FEATURE_SLICE, GateDecision, Source
 from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensors import Camera
 from tests.field_flights import fly, nees, small_euler_angles, state_errors, steps
 from tests.filter_states import set_at_rest
 from tests.unit.alarms import ALARM
+from tests.unit.compiled import Compiled
 
 SUITE = quad_gym.sensor_suite("uwb").simplified()
 ANCHORS, NOISE = np.array(SUITE.uwb_range.anchors_I), SUITE.uwb_range.noise_sigma
@@ -178,3 +180,22 @@ def test_optical_flow_at_a_vague_height_leaves_a_filter_consistent(kind):
     batch = fly(suite, 128, task="lemniscate", start="hover")
     steps(batch, 0.5)
     assert nees(batch).mean() < stats.chi2(15 * 128).ppf(1.0 - ALARM) / 128
+
+
+def factor(f, step):
+    f.factor = factor_of(f.further, step)
+
+
+factors = Compiled(factor, further=(), factor=())
+
+
+def test_steps_of_an_update_share_the_information_of_one():
+    """A measurement with k times the noise has 1 / k of the information."""
+    for further in range(MOST_STEPS + 1):
+        parts = [
+            1.0 / getattr(factors, instance)(step, further=[float(further)])["factor"][0]
+            for step in range(further + 1)
+            for instance in ("on_floats", "on_lanes")
+        ]
+        assert sum(parts) == pytest.approx(2.0, rel=1e-12)
+        assert (np.diff(parts[::2]) > 0.0).all()  # the first steps, far from the truth, count least

@@ -7,14 +7,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
+from quad_gym.kernels import exported
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.numbers.linalg import load3, store
+from quad_gym.kernels.numbers.linalg import load3, load4, store
 from quad_gym.kernels.numbers.rotation import (
     dcm_to_quaternion,
     euler_to_dcm,
+    mean_quaternion,
     quaternion_rate,
     quaternion_to_dcm,
+    rotation_between,
     split_rotation,
+    split_turn,
     turn_pair,
     turn_pair_back,
 )
@@ -54,6 +58,26 @@ FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,), "x": (
 FIELDS |= {"pair": (2, 3), "pair_back": (2, 3)}
 FIELDS |= dict.fromkeys(("R", "R_again", "even", "odd"), (3, 3))
 kernels = Compiled(attitude, **FIELDS)
+
+
+def two_attitudes(f, option):
+    a, b = load4(f.a), load4(f.b)
+    store(f.halfway, mean_quaternion(a, b))
+    store(f.turn, rotation_between(a, b))
+    even, odd = split_turn(load3(f.d))
+    store_rows(f.even, even)
+    store_rows(f.odd, odd)
+
+
+def quaternion_of_library(f, option):
+    q, length = exported._quaternion(f.R)
+    for k in range(4):
+        f.q[k] = q[k] / length
+
+
+libraries = Compiled(quaternion_of_library, R=(9,), q=(4,))
+fours = {"a": (4,), "b": (4,), "halfway": (4,), "turn": (3,)}
+pairs = Compiled(two_attitudes, **fours, d=(3,), even=(3, 3), odd=(3, 3))
 INSTANCES = ("on_floats", "on_lanes")
 
 angles = st.floats(-np.pi, np.pi)
@@ -197,6 +221,48 @@ def test_a_quaternion_turns_at_the_body_rates(instance):
     ahead *= np.sign((ahead * got["q"]).sum(axis=1, keepdims=True))
     behind *= np.sign((behind * got["q"]).sum(axis=1, keepdims=True))
     np.testing.assert_allclose(got["q_rate"], (ahead - behind) / (2 * h), rtol=0.0, atol=1e-9)
+
+
+def test_quaternion_of_a_filter_library_agrees_with_scipy():
+    rng = np.random.default_rng(14)
+    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(100, 3))])
+    axes /= np.linalg.norm(axes, axis=1)[:, np.newaxis]
+    turn = Rotation.from_rotvec(np.concatenate([np.pi * axes, 3.0 * axes, 0.3 * axes]))
+    R = np.swapaxes(turn.as_matrix(), 1, 2)
+    q = libraries.on_floats(R=R.reshape(-1, 9))["q"]
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=1e-15)
+    left = turn.inv() * Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    np.testing.assert_allclose(left.magnitude(), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+@pytest.mark.parametrize("sign", [1.0, -1.0])  # both are the same attitude
+def test_halfway_between_two_attitudes_agrees_with_scipy(instance, sign):
+    rng = np.random.default_rng(12)
+    turn = rng.normal(size=(100, 3))
+    turn *= rng.uniform(1e-3, 0.98 * np.pi, (100, 1)) / np.linalg.norm(turn, axis=1)[:, None]
+    first = Rotation.random(100, rng=rng)
+    last = first * Rotation.from_rotvec(turn)
+    a, b = (x.as_quat(canonical=True)[:, [3, 0, 1, 2]] for x in (first, last))
+    b *= sign * np.sign(np.sum(a * b, axis=1, keepdims=True))
+    got = getattr(pairs, instance)(a=a, b=b)
+    np.testing.assert_allclose(got["turn"], turn, rtol=0.0, atol=1e-12)
+    halfway = Rotation.from_quat(got["halfway"][:, [1, 2, 3, 0]])
+    left = (first * Rotation.from_rotvec(turn / 2)).inv() * halfway
+    np.testing.assert_allclose(left.magnitude(), 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5, np.pi])
+def test_even_and_odd_parts_of_a_rotation_vector_add_up_to_the_rotation(instance, size):
+    d = size * np.random.default_rng(13).normal(size=(50, 3))
+    d[0] = 0.0
+    got, mirrored = (getattr(pairs, instance)(d=x) for x in (d, -d))
+    R = np.swapaxes(Rotation.from_rotvec(d).as_matrix(), 1, 2)
+    whole = np.eye(3) + got["even"] + got["odd"]
+    np.testing.assert_allclose(whole, R, rtol=0.0, atol=2e-15 * (1.0 + size))
+    np.testing.assert_array_equal(mirrored["even"], got["even"])
+    np.testing.assert_array_equal(mirrored["odd"], -got["odd"])
 
 
 @given(eulers, eulers)

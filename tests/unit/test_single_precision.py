@@ -57,6 +57,39 @@ for refused in (
         print(error)
 """
 
+SINES = """
+import numpy as np
+from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.numbers.blocks import lanes_of
+from quad_gym.kernels.numbers.elementary import sin_cos
+from quad_gym.records import REAL, WIDTH, aligned_zeros
+
+@entry
+def evaluate(blocks):
+    for i in range(len(blocks)):
+        f = lanes_of(blocks[i])
+        f.sin, f.cos = sin_cos(f.x)
+
+names = ("x", "sin", "cos")
+blocks = aligned_zeros(2500, np.dtype([(name, REAL, (WIDTH,)) for name in names], align=True))
+x = blocks["x"]
+x[:] = np.random.default_rng(1).uniform(-1.0, 1.0, x.shape)
+x[:1000] *= 10.0
+x[1000:2000] *= 3e4
+x[2000:] = np.round(1e4 * x[2000:]) * np.pi / 2.0
+evaluate(blocks)
+truth = x.astype(float)
+print(*(np.abs(f(truth) - blocks[f.__name__]).max() for f in (np.sin, np.cos)))
+"""
+
+
+def test_sine_and_cosine_in_single_precision_have_their_documented_error(tmp_path):
+    script = tmp_path / "sines.py"
+    script.write_text(SINES)
+    done = run_python(script, QUAD_GYM_PRECISION="single")
+    assert done.returncode == 0, done.stderr
+    assert max(map(float, done.stdout.split())) < 1e-7
+
 
 def test_each_number_in_a_block_belongs_to_one_lane():
     places = places_of_lanes(FLIGHT_BLOCK)

@@ -83,7 +83,7 @@ def test_mirrored_vectors_still_give_a_proper_rotation():
     np.testing.assert_allclose(R_BI, expected.as_matrix(), rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
+@pytest.mark.parametrize("scale", [1e-200, 1e-12, 1e-6, 1e6, 1e12, 1e200])
 def test_the_size_of_the_weights_and_vectors_does_not_matter(scale):
     weights, v_I, v_B, _ = noisy_problem(3, 5, 0.1)
     expected = solve_wahba(weights, v_I, v_B)
