@@ -12,6 +12,7 @@ from quad_gym.records import AID_BLOCKS, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import batch as flights_of
 from tests.field_flights import fly, nees, steps
+from tests.filter_states import set_at_rest
 
 CRAZYFLIE = quad_gym.sensor_suite("crazyflie").simplified()
 FLOW, RANGE = int(Aid.OPTICAL_FLOW), int(Aid.RANGE_FINDER)
@@ -183,3 +184,38 @@ def test_a_crazyflie_hovers_on_its_estimate():
         batch.step(np.zeros((16, 4)))
     assert (np.linalg.norm(batch.record("v"), axis=1) < 0.3).all()
     assert (quaternion_to_dcm(batch.record("q"))[:, 2, 2] > 0.99).all()
+
+
+def test_expected_flow_is_the_mean_of_sigma_points():
+    """Also of a vehicle whose height and tilt have correlated errors.
+
+    A correction is linear in the measurement, and zero at the expected one.
+    """
+    suite = quad_gym.sensor_suite("rtk").simplified()
+    suite = suite.replace(optical_flow=quad_gym.OpticalFlowParams())
+    choice = {"recursive_update_threshold": None, "false_alarm_probability": 0.0}
+    estimator = suite.estimator.replace(ground_height=GROUND, **choice)
+    kf = UnscentedKalmanFilter(suite.replace(estimator=estimator))
+    position, velocity = np.array([1.0, -2.0, GROUND + 1.7]), np.array([9.0, -6.0, 0.5])
+    R_BI, sigma = euler_dcm((0.3, -0.25, 0.5)), np.repeat([0.1, 0.1, 0.05, 0.01], [3, 3, 3, 6])
+    P = np.diag(sigma**2)
+    for tilt, share in ((6, 0.7), (7, -0.6)):
+        P[2, tilt] = P[tilt, 2] = share * sigma[2] * sigma[tilt]
+    corrections = []
+    for flow in np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]):
+        set_at_rest(kf, P, position=position, velocity=velocity, R_BI=R_BI)
+        kf.update(optical_flow=flow)
+        corrections.append(np.concatenate([kf.position - position, kf.velocity - velocity]))
+    gain = np.transpose(corrections[1:]) - np.transpose(corrections[:1])
+    found = -np.linalg.lstsq(gain, corrections[0], rcond=None)[0]
+
+    def flow_at(dx):
+        R = euler_dcm(dx[6:9]) @ R_BI
+        return expected(position + dx[:3], velocity + dx[3:6], R, np.zeros(3))[:2]
+
+    c = estimator.alpha * np.sqrt(estimator.kappa + 15 + 2)  # with the two numbers measured
+    mean = center = flow_at(np.zeros(15))
+    for column in c * np.linalg.cholesky(P).T:
+        mean = mean + (flow_at(column) + flow_at(-column) - 2.0 * center) / (2.0 * c**2)
+    assert np.abs(mean - center).max() > 2e-3
+    np.testing.assert_allclose(found, mean, rtol=0.0, atol=1e-9)
