@@ -7,7 +7,10 @@ pages, and a test compares these with the rows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 from quad_gym.analysis.metrics import Estimated
 from quad_gym.analysis.reports import markdown_table
@@ -310,31 +313,74 @@ def outage_dash_memory(rows: Rows) -> str:
     )
 
 
+class Case(NamedTuple):
+    """Arms of a task that follows a reference, with one suite."""
+
+    task: str
+    suite: str
+    ideal: Rows  #: trained and tested on the truth
+    truth: Rows  #: trained on the truth, as all that follow tested on the estimate
+    estimate: Rows  #: trained on the estimate
+    rule: Rows  #: PD control
+
+    @property
+    def name(self) -> str:
+        """Name in a sentence."""
+        return f"{self.task} with `{self.suite}`"
+
+    @property
+    def seeds(self) -> int:
+        """Number of trainings of each arm."""
+        return min(self.truth.seeds, self.estimate.seeds)
+
+    @property
+    def column(self) -> str:
+        """Column that measures success in the task."""
+        return "success" if self.task == "Waypoints" else "error"
+
+    @property
+    def sign(self) -> float:
+        """Sign with which a larger number is worse."""
+        return -1.0 if self.column == "success" else 1.0
+
+    @property
+    def cost(self) -> Effect:
+        """Change of policies trained on the truth when they fly on the estimate."""
+        return effect(self.truth, self.ideal, self.column).scaled(self.sign)
+
+    @property
+    def gain(self) -> Effect:
+        """Part of the cost that training on the estimate takes away."""
+        return effect(self.truth, self.estimate, self.column).scaled(self.sign)
+
+
+def cases(rows: Rows) -> list[Case]:
+    """Cases that have been measured, in their order."""
+    found = []
+    for (task, steps), suite in product(TRACKING_STEPS.items(), SUITES):
+        arms = Arms(rows.where(task=task, suite=suite), steps)
+        names = ("truth_on_truth", "truth", "estimate", "pd")
+        with suppress(MissingRowsError):  # of a part that is not complete
+            found.append(Case(task, suite, *(arms[name] for name in names)))
+    if not found:
+        raise MissingRowsError("truth")
+    return found
+
+
 def when_to_train(rows: Rows) -> str:
     """Cost of flying on the estimate and gain of training on it, by task and suite, as a table."""
-    body = []
-    for task, steps in TRACKING_STEPS.items():
-        for suite in SUITES:
-            arms = Arms(rows.where(task=task, suite=suite), steps)
-            column = "success" if task == "Waypoints" else "error"
-            ideal, truth, estimate = (
-                arms[name] for name in ("truth_on_truth", "truth", "estimate")
-            )
-            cost, gain = effect(truth, ideal, column), effect(truth, estimate, column)
-            if column == "success":
-                cost, gain = cost.scaled(-1.0), gain.scaled(-1.0)
-            rule = arms["pd"].estimated(column)
-            body.append(
-                [
-                    task,
-                    f"`{suite}`",
-                    _shown(rule, column),
-                    _shown(ideal.estimated(column), column),
-                    _shown(cost.size, column),
-                    f"{_shown(gain.size, column)}{LINE}({verdict(gain)})",
-                    f"{truth.seeds}",
-                ]
-            )
+    body = [
+        [
+            case.task,
+            f"`{case.suite}`",
+            _shown(case.rule.estimated(case.column), case.column),
+            _shown(case.ideal.estimated(case.column), case.column),
+            _shown(case.cost.size, case.column),
+            f"{_shown(case.gain.size, case.column)}{LINE}({verdict(case.gain)})",
+            f"{case.seeds}",
+        ]
+        for case in cases(rows)
+    ]
     heads = [
         "task",
         "sensors",
@@ -349,24 +395,25 @@ def when_to_train(rows: Rows) -> str:
 
 def when_to_train_summary(rows: Rows) -> str:
     """In how many of the cases training on the estimate wins or loses significantly."""
-    wins: list[str] = []
-    losses: list[str] = []
-    cases = 0
-    for task, steps in TRACKING_STEPS.items():
-        for suite in SUITES:
-            arms = Arms(rows.where(task=task, suite=suite), steps)
-            column = "success" if task == "Waypoints" else "error"
-            gain = effect(arms["truth"], arms["estimate"], column)
-            gain = gain.scaled(-1.0) if column == "success" else gain
-            cases += 1
-            if gain.significant:
-                (wins if gain.size.value > 0.0 else losses).append(f"{task} with `{suite}`")
-    seeds = Arms(rows.where(task="Circle", suite="standard"), TRACKING_STEPS["Circle"])
-    return (
-        f"Training on the estimate is significantly better in {len(wins)} of {cases} cases"
-        f"{_listed(wins)}, and significantly worse in {len(losses)}{_listed(losses)} "
-        f"({seeds['truth'].seeds} seeds of each arm)."
+    measured, planned = cases(rows), len(TRACKING_STEPS) * len(SUITES)
+    changed = [case for case in measured if case.gain.significant]
+    wins, losses = (
+        [
+            f"{case.task} with `{case.suite}`"
+            for case in changed
+            if (case.gain.size.value > 0) == won
+        ]
+        for won in (True, False)
     )
+    counts = sorted({case.truth.seeds for case in measured})
+    seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    rest = planned - len(measured)
+    text = (
+        f"Training on the estimate is significantly better in {len(wins)} of {len(measured)} cases"
+        f"{_listed(wins)}, and significantly worse in {len(losses)}{_listed(losses)} "
+        f"({seeds} seeds of each arm)."
+    )
+    return text + (f" The other {rest} cases are not yet measured." if rest else "")
 
 
 def _listed(names: list[str]) -> str:

@@ -236,3 +236,25 @@ def test_every_conclusion_can_be_computed_once_all_parts_are_measured(tmp_path):
         Rows(rows).write(tmp_path / f"{table}.csv")
     assert conclusions.NOT_MEASURED not in "".join(conclusions.texts(tmp_path).values())
     assert conclusions.incomplete(folder=tmp_path) == []
+
+
+def test_cost_and_gain_have_signs_of_loss_and_recovery_and_list_measured_cases_only(tmp_path):
+    def success(arm):
+        return {"truth": 0.5, "estimate": 0.8, "truth_on_truth": 0.9}.get(arm, 0.7)
+
+    parts = {part.decides.removeprefix("Truth or estimate in training: "): part for part in PARTS}
+    chosen = [parts["Circle, standard"], parts["Waypoints, rtk"]]
+    rows = [row for part in chosen for row in complete_rows(part, success)]
+    Rows(rows).write(tmp_path / "when_to_train.csv")
+    found = conclusions.texts(tmp_path)
+    circle, waypoints = found["when_to_train.table"].strip().splitlines()[2:]
+    # the errors are 0.1, 0.5 and 0.2 m; of 0.4 m that the estimate costs, training regains 0.3 m
+    assert circle.startswith("| Circle | `standard` | 300 ")
+    assert "| 100 [100, 100] mm | 400 [400, 400] mm | 300 [300, 300] mm<br>(p < 0.001)" in circle
+    assert "| 90 [" in waypoints
+    assert "| 40 [" in waypoints
+    assert "| 30 [" in waypoints
+    summary = found["when_to_train.summary"]
+    assert "better in 2 of 2 cases (Circle with `standard`, Waypoints with `rtk`)" in summary
+    assert "significantly worse in 0 (10 seeds" in summary
+    assert "The other 13 cases are not yet measured." in summary
