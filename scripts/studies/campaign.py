@@ -272,9 +272,8 @@ def _processor_time() -> float:
 
 def _trained_elsewhere(training: Training, precision: str) -> bool:
     """Train in a process with another precision; returns True if all steps are completed."""
-    os.environ["QUAD_GYM_PRECISION"] = (
-        precision  # the new process inherits it; this one has read its own
-    )
+    # the new process inherits the variable; this one has already read its own
+    os.environ["QUAD_GYM_PRECISION"] = precision
     try:
         job = Job(training.folder / "logs", training)
     finally:

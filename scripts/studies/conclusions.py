@@ -397,15 +397,9 @@ def when_to_train_summary(rows: Rows) -> str:
     """In how many of the cases training on the estimate wins or loses significantly."""
     measured, planned = cases(rows), len(TRACKING_STEPS) * len(SUITES)
     changed = [case for case in measured if case.gain.significant]
-    wins, losses = (
-        [
-            f"{case.task} with `{case.suite}`"
-            for case in changed
-            if (case.gain.size.value > 0) == won
-        ]
-        for won in (True, False)
-    )
-    counts = sorted({case.truth.seeds for case in measured})
+    wins = [case.name for case in changed if case.gain.size.value > 0.0]
+    losses = [case.name for case in changed if case.gain.size.value < 0.0]
+    counts = sorted({case.seeds for case in measured})
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     rest = planned - len(measured)
     text = (

@@ -23,6 +23,12 @@ SETTLED = 2.5  #: time after which the filter has converged after its start [s]
 FOUND = 0.6  #: largest standard deviation of the position soon after an outage [m]
 
 
+def _clearance(part: Mapping[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
+    """Clearance in the next gap [m], and whether the position is more uncertain; (n, 1) each."""
+    room = 0.5 * part["gap_width"] - MARGIN
+    return room, SIGMAS * part["position_sigma"].max(axis=1, keepdims=True) > room
+
+
 class BacksOff(PDPolicy):
     """Mode "waiting" of PD control that also backs off from a wall in front of it.
 
@@ -41,8 +47,7 @@ class BacksOff(PDPolicy):
         across = gap - ahead * seen.heading
         across -= (across * seen.up).sum(axis=1, keepdims=True) * seen.up
         off = np.linalg.norm(across, axis=1, keepdims=True)
-        room = 0.5 * part["gap_width"] - MARGIN
-        uncertain = SIGMAS * part["position_sigma"].max(axis=1, keepdims=True) > room
+        room, uncertain = _clearance(part)
         near = (ahead > 0.0) & (ahead < BACK) & (off > room) & ~uncertain
         error = np.where(near, gap - BACK * seen.heading, seen.position_error)
         return seen._replace(position_error=error)
@@ -62,8 +67,7 @@ class SlowsDown(PDPolicy):
     def _read(self, rows: Array) -> Any:
         part = {name: rows[:, where] for name, where in self._slices.items()}
         seen = super()._read(rows)
-        error, room = seen.position_error, 0.5 * part["gap_width"] - MARGIN
-        uncertain = SIGMAS * part["position_sigma"].max(axis=1, keepdims=True) > room
+        error, (_, uncertain) = seen.position_error, _clearance(part)
         distance = np.linalg.norm(error, axis=1, keepdims=True)
         limited = error * np.minimum(1.0, self._reach / np.maximum(distance, 1e-9))
         return seen._replace(position_error=np.where(uncertain, self._share * limited, error))
