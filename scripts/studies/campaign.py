@@ -20,14 +20,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from baselines.recipes import IMITATION, Recipe, first_seed, recipe
+from baselines.recipes import IMITATION, Recipe, description, first_seed, recipe
 from baselines.training import train
 from quad_gym import IDS
-from quad_gym.analysis.reports import write_json
+from quad_gym.analysis.reports import as_json, write_json
+from quad_gym.envs.config import with_effect
 from quad_gym.experiments import PAUSE, Flown, Job, Training, Trial
 from quad_gym.records.sizes import PRECISION
 from scripts.studies.arms import Arm, chosen_arms
-from scripts.studies.rows import Rows
+from scripts.studies.rows import FIRST, Rows
 from scripts.studies.scores import worst_tenth
 from scripts.studies.study import Study
 from scripts.studies.tasks import STUDIED, StudiedTask
@@ -187,6 +188,29 @@ class Cell:
         if self.seed is None:
             return None
         return self.study.trainings_of(self.arm.flies or self.arm.name)[self.seed]
+
+    @property
+    def definition(self) -> str:
+        """Everything that the numbers follow from, as text: cells that share it have equal rows."""
+        flown = {
+            "env_id": self.trial.env_id,
+            "keywords": with_effect(self.trial.keywords),
+            "episodes": self.trial.episodes,
+            "first_episode": self.trial.first_episode,
+            "policy": self.arm.policy,
+            "training": None if self.training is None else description(self.training.plan),
+            "precision": self.arm.precision,
+            "flights": self.part.digest,
+            "columns": tuple(self.study.about.columns),
+        }
+        return json.dumps(as_json(flown), sort_keys=True)
+
+    def relabeled(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Row of a cell with the same `definition`, under the names of this one."""
+        kept = (*FIRST, "worst_tenth", *self.study.about.columns)
+        own = {"arm": self.arm.name, "label": self.arm.label, **self.part.columns}
+        seconds = row["seconds"] if self.trains else 0.0
+        return {**{name: row[name] for name in kept}, "seconds": seconds, **own}
 
     @property
     def trains(self) -> bool:

@@ -142,20 +142,34 @@ def write_tables(parts: Sequence[Part], root: Path, *, partial: bool) -> list[Pa
 
 
 def take_over(cells: Sequence[Cell]) -> int:
-    """Take the rows over that docs/data has of cells, on the present flights.
+    """Take the rows over that docs/data has of cells, or of equal cells of another table.
 
     Returns:
         Number of rows that were taken over.
     """
     known = {
         table: {row_key(row): row for row in Rows.read(DATA / f"{table}.csv").rows}
-        for table in {cell.part.table for cell in cells}
+        for table in TABLES
     }
-    count = 0
+    count, left = 0, []
     for cell in cells:
+        if cell.row is not None:
+            continue
         row = known[cell.part.table].get(cell.key)
-        if row is not None and cell.row is None:
+        if row is None:
+            left.append(cell)
+        else:
             cell.write(row)
+            count += 1
+    measured = {
+        cell.definition: row
+        for cell in cells_of(PARTS, OUTPUT)
+        if (row := known[cell.part.table].get(cell.key)) is not None
+    }
+    for cell in left:
+        row = measured.get(cell.definition)
+        if row is not None:
+            cell.write(cell.relabeled(row))
             count += 1
     return count
 
