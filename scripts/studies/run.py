@@ -1,8 +1,9 @@
 """Run everything behind the conclusions of the pages, and continue where it stopped.
 
-    python -m scripts.studies run --all                    # all tables, some 20 core hours
+    python -m scripts.studies run --all                    # all tables
     python -m scripts.studies run --all --jobs 2           # in two processes
     python -m scripts.studies run --tables look_around     # one of them
+    python -m scripts.studies run --all --parts "Circle: PPO" indoor   # some parts
     python -m scripts.studies run --all --list             # remaining rows and core hours
     python -m scripts.studies run --all --write            # write the rows so far into docs/data
 
@@ -55,6 +56,8 @@ class RunArgs:
     """run all tables"""
     tables: tuple[str, ...] = ()
     """names of tables to run; docs/data/NAME.csv"""
+    parts: tuple[str, ...] = ()
+    """words of the parts to run, as `--list` names them, such as "Circle: PPO"; all if none"""
     jobs: int = 1
     """number of processes, each with one thread"""
     list: bool = False
@@ -76,7 +79,13 @@ def chosen_parts(args: RunArgs) -> list[Part]:
     for name in args.tables:
         if name not in TABLES:
             raise ValueError(f"--tables must be of {', '.join(TABLES)}, got {name}")
-    return [part for part in PARTS if args.all or part.table in args.tables]
+    tables = [part for part in PARTS if args.all or part.table in args.tables]
+    parts = [p for p in tables if not args.parts or any(words in p.decides for words in args.parts)]
+    if not parts:
+        raise ValueError(
+            f"--parts must have words of a part that --list prints, got {', '.join(args.parts)}"
+        )
+    return parts
 
 
 def cells_of(parts: Sequence[Part], root: Path, seeds: int | None = None) -> list[Cell]:
@@ -241,7 +250,8 @@ def main(args: RunArgs) -> int:
 def _words(args: RunArgs) -> list[str]:
     """Command of a further process."""
     names = ["--all"] if args.all else ["--tables", *args.tables]
-    more = [] if args.seeds is None else ["--seeds", str(args.seeds)]
+    more = ["--parts", *args.parts] if args.parts else []
+    more += [] if args.seeds is None else ["--seeds", str(args.seeds)]
     return [
         sys.executable,
         "-m",

@@ -258,3 +258,34 @@ def test_cost_and_gain_have_signs_of_loss_and_recovery_and_list_measured_cases_o
     assert "better in 2 of 2 cases (Circle with `standard`, Waypoints with `rtk`)" in summary
     assert "significantly worse in 0 (10 seeds" in summary
     assert "The other 13 cases are not yet measured." in summary
+
+
+def test_row_of_an_equal_cell_of_another_table_is_taken_over(small, monkeypatch, tmp_path):
+    twin = dataclasses.replace(SMALL, table="twin", columns={"task": "Twin"})
+    other = dataclasses.replace(SMALL, table="other", parameters={"gamma": 0.5})
+    assert run.main(small) == 0
+    monkeypatch.setattr(run, "PARTS", (SMALL, twin, other))
+    monkeypatch.setattr(run, "TABLES", ("small", "twin", "other"))
+    cells = {
+        part.table: run.cells_of([part], tmp_path / "elsewhere") for part in (SMALL, twin, other)
+    }
+    assert run.take_over([*cells["twin"], *cells["other"]]) == 6
+    for own, mine in zip(cells["small"], cells["twin"], strict=True):
+        same = own.part.cells(small.output)
+        (measured,) = [cell.row for cell in same if cell.key == own.key]
+        assert mine.row["task"] == "Twin"
+        assert mine.row["return"] == pytest.approx(measured["return"], rel=1e-9)
+        assert mine.row["seconds"] == measured["seconds"]
+    # with another discount only the fixed rule flies the same
+    assert [cell.row is not None for cell in cells["other"]] == [True, *[False] * 4]
+
+
+def test_parts_are_chosen_by_words_of_their_names(small, capsys, monkeypatch):
+    second = dataclasses.replace(SMALL, table="second", decides="something else")
+    monkeypatch.setattr(run, "PARTS", (SMALL, second))
+    monkeypatch.setattr(run, "TABLES", ("small", "second"))
+    assert run.main(dataclasses.replace(small, list=True, parts=("else",))) == 0
+    assert capsys.readouterr().out.startswith("something else: 0 of 5 rows")
+    with pytest.raises(SystemExit):
+        run.main(dataclasses.replace(small, list=True, parts=("unknown",)))
+    assert "--parts must have words of a part" in capsys.readouterr().err
