@@ -102,7 +102,7 @@ class Aid(IntEnum):
     """Sensors of one reading, with parameters in `aid_...`: the last of `Sensor`, in this order.
 
     The name in lower case is the field of `SensorSuite`. The fault that silences a sensor
-    (`FaultKind`), its stage, its blocks of the measurement and its part of a raw observation are
+    (`LOSSES`), its stage, its blocks of the measurement and its part of a raw observation are
     derived from it.
     """
 
@@ -235,7 +235,11 @@ class Supply(IntEnum):
 
 
 class FaultKind(IntEnum):
-    """Kinds of faults; a flight has at most one fault of each kind, which may recur."""
+    """Kinds of faults; a flight has at most one fault of each kind, which may recur.
+
+    Recorded flights contain the numbers, and a fault's draws follow its number: every member keeps
+    its number, and new ones come last, also the loss of a new sensor.
+    """
 
     GNSS_OUTAGE = 0
     GNSS_OUTLIERS = 1
@@ -249,11 +253,26 @@ class FaultKind(IntEnum):
     GYRO_BIAS_STEP = 9
     IMU_SATURATION = 10
     ROTOR_LOSS = 11
+    BAROMETER_LOSS = 12
+    MAGNETOMETER_LOSS = 13
+    OPTICAL_FLOW_LOSS = 14
+    RANGE_FINDER_LOSS = 15
+    UWB_RANGE_LOSS = 16
+    MAGNETOMETER_DISTURBANCE = 17
 
-    _ignore_ = "aid"
-    for aid in Aid:  # the sensor is silent: BAROMETER_LOSS and so on
-        vars()[f"{aid.name}_LOSS"] = 12 + aid
-    MAGNETOMETER_DISTURBANCE = 12 + len(Aid)
+
+def _losses() -> tuple[FaultKind, ...]:
+    names = [f"{aid.name}_LOSS" for aid in Aid]
+    for name in names:
+        if name not in FaultKind.__members__:
+            last = max(FaultKind)
+            raise ValueError(
+                f"FaultKind must have {name} = {last + 1} behind {last.name}, got none"
+            )
+    return tuple(FaultKind[name] for name in names)
+
+
+LOSSES = _losses()  #: faults that silence aiding sensors, in the order of `Aid`
 
 
 class FieldFault(IntEnum):

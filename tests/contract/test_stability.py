@@ -13,7 +13,9 @@ from baselines import PDPolicy
 from baselines.mlp import MlpPolicy
 from baselines.policies import load_policy
 from docs.renewal import release
+from quad_gym import records
 from quad_gym.commands import sweep
+from quad_gym.faults import MagnetometerDisturbance, SensorLoss, named_faults
 from quad_gym.logs.formats.reading import read_log
 from tests import console_commands, interface
 
@@ -86,6 +88,24 @@ def test_flight_of_1_0_is_read_with_the_same_numbers():
     stored = np.load(FILES / "flight.npz")
     for name in ("position", "estimated_position", "quaternion", "action"):
         np.testing.assert_array_equal(flight[name], stored[f"columns/{name}"])
+
+
+def test_members_of_1_0_keep_their_numbers():
+    """Recorded flights, `info` in stored data and users of exported filters contain the numbers."""
+    for kind, numbers in json.loads((FILES / "numbers.json").read_text()).items():
+        now = getattr(records, kind).__members__
+        assert {name: int(now[name]) for name in numbers} == numbers
+        assert len(set(now.values())) == len(now), "two members have the same number"
+
+
+def test_faults_of_a_flight_of_1_0_are_read_by_their_names():
+    """The barometer was lost from 0.1 to 0.3 s, the magnetometer disturbed from 0.2 to 0.6 s."""
+    flight = quad_gym.Flight.load(FILES / "faults.npz")
+    steps = np.rint(50.0 * flight["time"])
+    kinds = (SensorLoss(sensor="barometer"), MagnetometerDisturbance())
+    active = named_faults(kinds, flight["faults"])
+    np.testing.assert_array_equal(active["barometer_loss"], (steps >= 5) & (steps < 15))
+    np.testing.assert_array_equal(active["magnetometer_disturbance"], (steps >= 10) & (steps < 30))
 
 
 @pytest.mark.parametrize(

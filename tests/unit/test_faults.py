@@ -2,6 +2,7 @@
 draw, so on the true state the difference between both flights is the effect of the fault."""
 
 import math
+from enum import IntEnum
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from quad_gym.records import (
     Aid,
     FaultKind,
     Source,
+    enums,
 )
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly
@@ -331,6 +333,14 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     dw = torque / np.diag(vehicle.inertia)[:2] * DT
     measured = (faulty.record("w") - calm.record("w"))[:, :2]
     np.testing.assert_allclose(measured, dw, rtol=0.05, atol=5e-3)
+
+
+def test_sensor_without_a_fault_that_silences_it_is_refused(monkeypatch):
+    more = IntEnum("Aid", [(aid.name, int(aid)) for aid in Aid] + [("DEPTH", len(Aid))])
+    monkeypatch.setattr(enums, "Aid", more)
+    number = len(FaultKind)
+    with pytest.raises(ValueError, match=f"FaultKind must have DEPTH_LOSS = {number} behind"):
+        enums._losses()
 
 
 def test_fault_presets_are_found_by_name():

@@ -25,11 +25,11 @@ from quad_gym.records import (
     FIRST_GROUP,
     GROUP_BLOCK,
     GROUP_COUNT,
+    LOSSES,
     MOST_BLOCKS,
     STAMP,
     Act,
     Aid,
-    FaultKind,
     Sensor,
 )
 
@@ -382,12 +382,6 @@ def sample_of(
 # three numbers and of one, and constant errors of scale and alignment.
 # --------------------------------------------------------------------------------------------------
 
-AID_LOSS = FaultKind[f"{Aid(0).name}_LOSS"].value
-"""First of the faults that silence aiding sensors, which are in the same order."""
-
-for _aid in Aid:
-    assert FaultKind[f"{_aid.name}_LOSS"] == AID_LOSS + _aid
-
 
 @kernel
 def _begin(flight, p, settings, s, mask):
@@ -459,7 +453,7 @@ def aid_stage(
         align: As in `sensor_stage`; optional.
         disturb: As in `sample_of`; optional.
     """
-    s, sensor = int(aid), FIRST_AID + int(aid)
+    s, sensor, loss = int(aid), FIRST_AID + int(aid), int(LOSSES[aid])
     first, draw, disturb = AID_BLOCK[s], draw or _draw_nothing, disturb or _disturb_nothing
 
     @kernel
@@ -471,7 +465,7 @@ def aid_stage(
     def when(flight, p, settings, mask, starting):  # type: ignore[no-untyped-def]
         due = _due(flight, p, settings, s, mask, starting)
         if settings.faults:
-            due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
+            due = due & (flight.fault_active[loss] <= 0.0)
         return due
 
     @kernel
