@@ -83,6 +83,8 @@ class FlyArgs:
     output: Path | None = None
     """file to write instead of opening a window: a video (.mp4, .gif or .webp), saved with the
     flight as .npz; or only the flight (.npz or .csv)"""
+    overwrite: bool = False
+    """replace these files if they exist"""
     replay: Path | None = None
     """saved flight (.npz) to show instead of a new one"""
 
@@ -107,6 +109,8 @@ def check_options(args: FlyArgs) -> None:
         if ending in VIDEO_ENDINGS:
             checked_video_path(args.output)
         require_writable("--output", args.output.parent)
+        for file in files_of(args.output, args):
+            options.refuse_overwriting(file, args.overwrite)
     if ending is None or ending in VIDEO_ENDINGS:
         Renderer(args.view, args.size)
 
@@ -154,19 +158,28 @@ def watch(flights: Iterator[Flight], args: FlyArgs, window: Window) -> None:
             return
 
 
-def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
+def files_of(path: Path, args: FlyArgs) -> tuple[Path, ...]:
+    """Return the files that are written: of a video of a new flight, also the flight."""
+    alone = path.suffix.lower() not in VIDEO_ENDINGS or args.replay is not None
+    return (path,) if alone else (path, path.with_suffix(".npz"))
+
+
+def write(flight: Flight, path: Path, args: FlyArgs) -> tuple[Path, ...]:
     """Write the flight to a file, for videos together with its data; return the files."""
     ending = path.suffix.lower()
     if ending in (".npz", ".csv"):
-        return [flight.save(path) if ending == ".npz" else flight.to_csv(path)]
+        return (flight.save(path) if ending == ".npz" else flight.to_csv(path),)
 
     def progress(times: Iterable[float]) -> Iterator[float]:
         yield from tqdm(times, desc="rendering", unit=" frames")
         print(f"encoding {path} ...", file=sys.stderr, flush=True)
 
     look: dict[str, Any] = {name: getattr(args, name) for name in ("view", "size", "fps", "speed")}
-    video = save_video(flight, path, progress=progress, **look)
-    return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
+    save_video(flight, path, progress=progress, **look)
+    files = files_of(path, args)
+    for data in files[1:]:
+        flight.save(data)
+    return files
 
 
 def flights_of(args: FlyArgs) -> Callable[[int], Iterator[Flight]]:

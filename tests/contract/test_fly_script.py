@@ -1,6 +1,7 @@
 """Tests of the command `fly`."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -88,6 +89,22 @@ def test_faults_begin_and_end_at_given_times(tmp_path):
     assert sigma[99] > 10.0 * sigma[50]  # the uncertainty grows in the outage
     assert sigma[110] < 0.1 * sigma[99]
     assert not flight.scene.has_camera
+
+
+@pytest.mark.parametrize("existing", ["film.gif", "film.npz"])
+def test_existing_file_is_replaced_only_with_overwrite(existing, tmp_path):
+    (tmp_path / existing).write_bytes(b"results of an earlier day")
+    args = script.FlyArgs(env_id="QuadGym/Hover-v0", output=tmp_path / "film.gif")
+    with pytest.raises(ValueError, match=f"{existing} exists: use --overwrite to replace it"):
+        script.check_options(args)
+    script.check_options(replace(args, overwrite=True))
+
+
+def test_video_of_a_saved_flight_leaves_the_flight_as_it_is(tmp_path):
+    args = script.FlyArgs(output=tmp_path / "film.gif", replay=tmp_path / "film.npz")
+    args.replay.write_bytes(b"the saved flight")
+    script.check_options(args)
+    assert script.files_of(args.output, args) == (args.output,)
 
 
 def test_window_without_display_ends_with_hint_to_write_video(tmp_path):
