@@ -47,6 +47,8 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         ImportError: If cuda-core or Numba is not installed.
     """
 
+    _seeded = False
+
     @shows(VectorKeywords)
     def __init__(
         self,
@@ -102,7 +104,16 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             raise ValueError(
                 f"options on a GPU must be reset_mask alone, got {next(iter(options))}"
             )
-        seen = self.batch.reset(self._keys(seed), mask if self._seeded else None)
+        if not self._seeded:
+            mask = None
+        elif isinstance(seed, (list, tuple, np.ndarray)):
+            seeds = seeds_of(list(seed), self.num_envs)
+            everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+            mask = everyone if mask is None else mask
+            known = torch.tensor([one is not None for one in seeds], device=self.device)
+            self.batch.reset(None, mask & ~known)
+            mask = mask & known
+        seen = self.batch.reset(self._keys(seed), mask)
         self._seeded = True
         return self._split(seen), {}
 

@@ -307,7 +307,6 @@ class Rendered:
     render_mode: str | None
     rendering: "Rendering | None"
     _spec: EnvSpec | None = None
-    _seeded = False
 
     def _open(
         self, flights: Flights, mode: str | None, render_flights: Sequence[int] | None = None
@@ -323,6 +322,12 @@ class Rendered:
 
             options = {name.removeprefix("render_"): value for name, value in given.items()}
             self.rendering = Rendering(flights.batch, mode, **options)
+
+    @property
+    def _begun(self) -> bool:
+        """True if all flights have an episode, of a reset or of a restored snapshot."""
+        batch = self.flights.batch
+        return batch.begun or bool(batch.record("episode").all())
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -342,7 +347,7 @@ class Rendered:
             gymnasium.logger.warn(
                 f"render() needs a render_mode: {make}(..., render_mode='rgb_array')"
             )
-        elif not self._seeded:
+        elif not self._begun:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         return self.rendering
 

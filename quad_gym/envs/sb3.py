@@ -85,12 +85,12 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         seeds = list(self._seeds)
         batch = self.flights.batch
         start = self._start_values()
-        if not self._seeded or any(seed is not None for seed in seeds):
-            chosen = np.array([not self._seeded or seed is not None for seed in seeds])
+        begun = self._begun
+        if not begun or any(seed is not None for seed in seeds):
+            chosen = np.array([not begun or seed is not None for seed in seeds])
             observations = batch.reset(keys=stream_keys(seeds), mask=chosen, **start)
             if not chosen.all():
                 observations = batch.reset(mask=~chosen, **start)
-            self._seeded = True
         else:
             observations = batch.reset(**start)
         if self.rendering is not None:
@@ -105,7 +105,7 @@ class QuadSB3VecEnv(Rendered, VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Store the actions of the coming step, (n, 4) in [-1, 1]; larger values are clipped."""
-        if not self._seeded:
+        if not self._begun:
             raise RuntimeError("call reset() before step()")
         self._pending = checked_actions(actions, (self.num_envs, 4))
 

@@ -251,10 +251,9 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         start = self.flights.start(options)
         super().reset(seed=check.seed("seed", seed))
         batch = self.flights.batch
-        if seed is not None or not self._seeded:
+        if seed is not None or not self._begun:
             keys = stream_key(self.np_random)[np.newaxis]
             observations = batch.reset(keys=keys, **start)
-            self._seeded = True
         else:
             observations = batch.reset(**start)
         self._over = False

@@ -122,9 +122,8 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         if seed is not None and not isinstance(seed, (list, tuple, np.ndarray)):
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(int(seed))
         batch = self.flights.batch
-        if not self._seeded:
+        if not self._begun:
             observations = batch.reset(keys=stream_keys(seeds), **start)
-            self._seeded = True
         else:
             chosen = mask & np.array([s is not None for s in seeds])
             goes_on = mask & ~chosen
@@ -177,7 +176,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         batch = self.flights.batch
         if not batch.begun:  # a snapshot may have been restored
             self._over = batch.record("needs_reset") > 0.0
-            if not batch.record("episode").all():
+            if not self._begun:
                 raise gymnasium.error.ResetNeeded("call reset() before step()")
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
         if disabled and self._over.any():

@@ -174,6 +174,25 @@ def test_snapshot_fits_any_time_limit_and_number_of_threads():
     assert_same(mine.read("position"), other.read("position"))
 
 
+@pytest.mark.parametrize("kind", ["single", "vector", "sb3"])
+def test_environment_that_was_never_reset_goes_on_from_a_snapshot(kind):
+    """Its flights have begun: steps, masked resets and streams are those of the original."""
+    if kind == "single":
+        env, fresh = (gymnasium.make("QuadGym/Hover-v0").unwrapped for _ in range(2))
+    elif kind == "vector":
+        env, fresh = (vec_env(count=3, autoreset_mode="Disabled") for _ in range(2))
+    else:
+        env, fresh = (quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=3) for _ in range(2))
+    env.reset()
+    fresh.flights.batch.restore(env.flights.batch.snapshot())
+    options = {"options": {"reset_mask": np.arange(3) == 1}} if kind == "vector" else {}
+    action, futures = np.zeros(4 if kind == "single" else (3, 4)), []
+    for one in (env, fresh):
+        stepped, again = one.step(action)[:3], one.reset(**options)
+        futures.append([*stepped, again if kind == "sb3" else again[0], state_of(one)])
+    assert_same(*futures)
+
+
 @pytest.mark.parametrize("task", [None, Chase], ids=["built-in task", "own task"])
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec], ids=["single", "vector"])
 def test_end_of_an_episode_is_restored_with_it(make, task):

@@ -229,6 +229,18 @@ def test_reset_mask_of_device_flights_begins_these_episodes_alone(three):
     assert_mask_begins_one_episode(three)
 
 
+def test_flights_without_a_seed_in_a_list_go_on_with_their_streams(three):
+    """As in `QuadVectorEnv`: a flight whose seed is None continues, also with a mask."""
+    three.reset(seed=5)
+    first = three.batch.record("key").clone()
+    mask = torch.tensor([True, True, False])
+    three.reset(seed=[7, None, 8], options={"reset_mask": mask})
+    last = three.batch.record("key")
+    assert torch.equal(last[1:], first[1:])
+    assert not torch.equal(last[0], first[0])
+    assert three.batch.record("episode").tolist() == [1.0, 2.0, 1.0]
+
+
 def test_written_steps_of_device_flights_move_the_time_limits():
     made = {"autoreset_mode": "NextStep", **TRUTH, "max_episode_steps": 5}
     assert_written_steps_move_the_time_limits(device_env("circle", 7, **made))
