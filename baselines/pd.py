@@ -71,7 +71,7 @@ _ABSOLUTE_FIELDS = (
 )
 
 
-def _require_plain_observations(env: Any) -> None:
+def require_plain_observations(env: Any) -> None:
     """Reject environments with wrappers that change observations or their space."""
     kinds = (gymnasium.ObservationWrapper, gymnasium.vector.VectorObservationWrapper)
     layer = env
@@ -151,7 +151,7 @@ class PDPolicy:
         flights = getattr(getattr(env, "unwrapped", env), "flights", None)
         if flights is None:
             raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
-        _require_plain_observations(env)
+        require_plain_observations(env)
         if flights.observation == "measurements":
             raise ValueError('env must observe a state: observation="measurements" contains none')
         needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS

@@ -13,7 +13,7 @@ import gymnasium
 from baselines.crazyflie_pid import SLOW, CrazyfliePID
 from baselines.mlp import MlpPolicy, checked_record
 from baselines.normalization import normalized, require_statistics
-from baselines.pd import REACH_OF_GAPS, PDPolicy
+from baselines.pd import REACH_OF_GAPS, PDPolicy, require_plain_observations
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
@@ -58,7 +58,7 @@ def interface_of(env: Any) -> dict[str, Any]:
     }
 
 
-def load_policy(name: str, env: Any, normalization: Any = None) -> Policy:
+def load_policy(name: str | Path, env: Any, normalization: Any = None) -> Policy:
     """Load a policy for an environment.
 
     Args:
@@ -78,12 +78,14 @@ def load_policy(name: str, env: Any, normalization: Any = None) -> Policy:
 
     Raises:
         ValueError: If the policy does not exist, does not fit the environment, or lies next to
-            statistics of `VecNormalize` that are not given.
+            statistics of `VecNormalize` that are not given; or if a wrapper changes observations,
+            which included policies and those with statistics need as they are.
         ImportError: If the file is a `.zip` and Stable-Baselines3 is not installed.
 
     Warns:
         UserWarning: If a `.npz` was trained on another task.
     """
+    name = str(name)
     of_file = not (name in _PD or name == _CRAZYFLIE or name.startswith("pd:") or is_included(name))
     if normalization is not None and not of_file:
         raise ValueError(
@@ -98,6 +100,8 @@ def load_policy(name: str, env: Any, normalization: Any = None) -> Policy:
     file = pretrained_file(task_of(env), name) if is_included(name) else Path(name)
     if file.suffix == ".npz":
         policy: Any = MlpPolicy.load(file)
+        if is_included(name):
+            require_plain_observations(env)
         _require_agreement(file, policy.record, env)
         _require_size(file, policy.inputs, env)
         trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))
@@ -229,6 +233,8 @@ def _is_unbounded(space: Any, bounded: Any) -> bool:
 def _normalized(file: Path, policy: Any, normalization: Any, env: Any) -> Policy:
     """Policy with its statistics; a ValueError if they are of observations of another size."""
     found = normalized(str(file), policy, normalization)
+    if getattr(found, "normalization", None) is not None:
+        require_plain_observations(env)
     if found is not policy and (size := len(found.normalization.mean)) != _size_of(env):
         source = f" in {normalization}" if isinstance(normalization, str | Path) else ""
         raise ValueError(

@@ -145,6 +145,20 @@ def test_statistics_of_gymnasium_wrapper_are_used(vector, tmp_path):
     np.testing.assert_array_equal(Normalization.of(tmp_path / "statistics.npz")(seen), expected)
 
 
+@pytest.mark.parametrize("name", ["pd", "pretrained", "file with statistics"])
+def test_policy_for_original_observations_is_refused_behind_a_wrapper_that_changes_them(
+    name, tmp_path
+):
+    if name == "file with statistics":
+        normalization = Normalization(np.zeros(28), np.ones(28))
+        name = tmp_path / "policy.npz"
+        MlpPolicy([np.zeros((4, 28))], [np.zeros(4)], ["none"], {}, normalization).save(name)
+    assert load_policy(name, plain(1)) is not None
+    wrapped = gymnasium.wrappers.vector.NormalizeObservation(plain(1))
+    with pytest.raises(ValueError, match=r"original observations.*NormalizeObservation changes"):
+        load_policy(name, wrapped)
+
+
 def test_policy_trained_behind_gymnasium_wrapper_needs_its_statistics(tmp_path):
     env = gymnasium.wrappers.NormalizeObservation(gymnasium.make(HOVER, **KEYWORDS))
     model = sb3.PPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu")
@@ -227,6 +241,8 @@ def test_statistics_that_do_not_fit_are_refused(trained, tmp_path):
     for mean, deviation, clip in ((one, 0.0 * one, 1.0), (np.nan * one, one, 1.0), (one, one, 0.0)):
         with pytest.raises(ValueError, match="mean of a normalization must be finite"):
             Normalization(mean, deviation, clip)
+    with pytest.raises(ValueError, match=r"original observations.*VecNormalize changes them"):
+        load_policy(name, env, normalization=env)  # they would be normalized twice
     with pytest.raises(ValueError, match="normalization must not be given for pd"):
         load_policy("pd", plain(1), normalization=env)
     twins = VecNormalize(quad_gym.make_sb3_vec_env(HOVER, n_envs=2, privileged=True, **KEYWORDS))
