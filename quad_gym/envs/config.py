@@ -10,6 +10,8 @@ from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, TypeAlias, TypeVar
 
+import numpy as np
+
 from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration
 from quad_gym.envs.spaces import ACTIONS, LAYOUTS, OBSERVATIONS
 from quad_gym.faults import GnssOutage, felt_without_sensors
@@ -333,7 +335,8 @@ def kind_and_tasks(task: "Own | None", base: "Base | None") -> "tuple[str, tuple
 
 def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
     """Return True if an environment with these keywords simulates no sensor."""
-    asked = any(keywords.get(name) is True for name in ("run_filter", "include_std", "innovations"))
+    flags = (keywords.get(name) for name in ("run_filter", "include_std", "innovations"))
+    asked = any(isinstance(flag, bool | np.bool_) and flag for flag in flags)
     return keywords.get("observation") in ("truth", "noisy") and not asked
 
 

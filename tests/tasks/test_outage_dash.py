@@ -172,8 +172,9 @@ def test_gaps_passed_are_counted_by_the_true_position(mode):
 
 def test_outage_without_sensors_is_refused():
     assert make(1, observation="truth").unwrapped.flights.batch.faults == ()
-    watched = make(1, observation="truth", include_std=True)
-    assert len(watched.unwrapped.flights.batch.faults) == 1
+    for true in (True, np.True_):
+        watched = make(1, observation="truth", include_std=true)
+        assert len(watched.unwrapped.flights.batch.faults) == 1
     with pytest.raises(ValueError, match=r"no effect on sensors .GnssOutage. where no filter runs"):
         make(1, observation="truth", faults=[quad_gym.faults.GnssOutage(start=1.0)])
 
