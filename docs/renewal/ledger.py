@@ -12,7 +12,7 @@ from typing import Any
 
 from docs.renewal import release
 from docs.renewal.catalog import Result
-from scripts.estimate_bench.table import table as bench_table
+from scripts.estimate_bench import table as estimate_bench
 from scripts.studies import conclusions
 
 FILE = Path(__file__).with_name("ledger.json")
@@ -63,4 +63,4 @@ def texts(entries: dict[str, Any]) -> dict[str, str]:
 
 def measured_per_seed() -> dict[str, str]:
     """Texts of studies and of the benchmark, computed from the rows per seed in docs/data."""
-    return conclusions.texts() | {"benchmark.table": f"\n{bench_table()}\n"}
+    return conclusions.texts() | estimate_bench.texts()

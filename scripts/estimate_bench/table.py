@@ -6,14 +6,25 @@ from pathlib import Path
 from quad_gym.analysis.metrics import Estimated
 from quad_gym.analysis.reports import markdown_table
 from scripts.estimate_bench.entries import FILE, Entry
-from scripts.estimate_bench.rows import MEMORY, arms_of
+from scripts.estimate_bench.rows import MEMORY, SEEDS, arms_of
 from scripts.estimate_bench.tasks import TASKS, BenchTask
 from scripts.studies.campaign import DATA, flights_digest
+from scripts.studies.conclusions import LINE, verdict
 from scripts.studies.report import number, share
-from scripts.studies.rows import Rows
+from scripts.studies.rows import Rows, effect
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
 HEADS = ("row", "track", "seeds", "success", "crashed", "return", "score", "processor seconds")
+
+COMPARED: Mapping[str, tuple[str, str]] = {
+    "training on the estimate, not the truth": ("estimate", "truth"),
+    "observing standard deviations, trained on the estimate": ("estimate_std", "estimate"),
+    "observing standard deviations, trained on the truth": ("truth_std", "truth"),
+    "privileged critic": ("privileged", "estimate_std"),
+    "independent noise on the truth": ("noisy", "truth"),
+    "randomized dynamics": ("randomized", "noisy"),
+}
+"""Changes of the training whose effects the page compares: the rows with and without each."""
 
 
 def score(returned: Estimated, rule: float, ideal: float) -> Estimated:
@@ -103,8 +114,34 @@ def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
     return "\n\n".join(parts)
 
 
-def table(file: Path = DATA / "estimate_bench.csv", entries: Path = ENTRIES) -> str:
+def effects(measured: Rows) -> str:
+    """Differences of returns between pairs of rows, by task, as Markdown.
+
+    A task without all seeds of both rows has an empty cell.
+    """
+    body = []
+    for change, pair in COMPARED.items():
+        cells = []
+        for task in TASKS:
+            own = measured.where(task=task.name, flights=flights_digest(task.flights))
+            first, second = (own.of(arm) for arm in pair)
+            complete = min(first.seeds, second.seeds) >= SEEDS
+            found = effect(first, second, "return") if complete else None
+            cells.append(
+                "" if found is None else f"{number(found.size, 0)}{LINE}({verdict(found)})"
+            )
+        body.append([change, *cells])
+    return f"\n{markdown_table(('change', *(task.name for task in TASKS)), body)}\n"
+
+
+def table(measured: Rows, entries: Path = ENTRIES) -> str:
     """All tasks, as Markdown."""
-    measured, entered = Rows.read(file), entry_rows(entries)
+    entered = entry_rows(entries)
     blocks = [block(task, measured, entered.get(task.name, Rows(()))) for task in TASKS]
-    return "\n" + "\n\n".join(blocks)
+    return "\n\n" + "\n\n".join(blocks) + "\n"
+
+
+def texts(file: Path = DATA / "estimate_bench.csv") -> dict[str, str]:
+    """Texts of the page, by the names of their marks."""
+    measured = Rows.read(file)
+    return {"benchmark.table": table(measured), "benchmark.effects": effects(measured)}

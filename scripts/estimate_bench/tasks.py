@@ -57,7 +57,7 @@ TASKS: tuple[BenchTask, ...] = (
         gamma=0.99,
         reward_scale=0.2,
         starts={"out_of_bounds": 3.0},
-        rule="pd:features_when_uncertain",
+        rule="planning",
         rule_environment=_STD,
         measurements=False,  # it observes the direction of the markers from the estimate
     ),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from quad_gym.analysis.metrics import Estimated
 from scripts.estimate_bench import __main__ as command
 from scripts.estimate_bench import entries, table
-from scripts.estimate_bench.rows import PARTS, arms_of
+from scripts.estimate_bench.rows import PARTS, SEEDS, arms_of
 from scripts.estimate_bench.tasks import TASK, TASKS
 from scripts.studies.rows import Rows
 
@@ -133,25 +134,37 @@ def test_every_task_has_all_rows_in_some_part():
         assert measured == {arm.name for arm in arms_of(task)}
 
 
+def measured(arm, seed, value, flights=None):
+    """Return a row of Circle, of its present flights unless others are given."""
+    numbers = {"success": 1.0, "crashed": 0.0, "return": value, "return_sd": 1.0, "seconds": 9.0}
+    shown = {"arm": arm, "label": arm, "seed": seed, "steps": 1, "episodes": 100}
+    flights = flights or table.flights_digest(TASK["Circle"].flights)
+    return {**shown, **numbers, "flights": flights, "task": "Circle"}
+
+
+def test_effects_of_training_are_differences_of_complete_rows():
+    estimate = 15.0 + np.linspace(0.0, 1.0, SEEDS)
+    truth = estimate - 2.0 + np.tile([0.3, -0.3], SEEDS // 2)
+    rows = [measured("estimate", seed, value) for seed, value in enumerate(estimate)]
+    rows += [measured("truth", seed, value) for seed, value in enumerate(truth)]
+    rows += [measured("estimate_std", seed, 99.0) for seed in range(SEEDS - 1)]
+    lines = table.effects(Rows(rows)).strip().split("\n")
+    cells = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
+    of_circle = [task.name for task in TASKS].index("Circle")
+    trained = cells["training on the estimate, not the truth"]
+    assert [cell.strip() for k, cell in enumerate(trained) if k != of_circle] == [""] * 4
+    assert re.fullmatch(r" 2 \[[12], [23]\]<br>\(p < 0.001\) ", trained[of_circle])
+    # the row with a standard deviation lacks a seed
+    incomplete = cells["observing standard deviations, trained on the estimate"]
+    assert incomplete[of_circle].strip() == ""
+
+
 def test_table_shows_rows_of_the_present_flights_only():
     task = TASK["Circle"]
-    now = table.flights_digest(task.flights)
-
-    def row(arm, seed, value, flights=now):
-        numbers = {
-            "success": 1.0,
-            "crashed": 0.0,
-            "return": value,
-            "return_sd": 1.0,
-            "seconds": 9.0,
-        }
-        shown = {"arm": arm, "label": arm, "seed": seed, "steps": 1, "episodes": 100}
-        return {**shown, **numbers, "flights": flights, "task": "Circle"}
-
-    rows = [row("rule", None, 10.0)]
-    rows += [row("truth_on_truth", seed, 20.0) for seed in range(3)]
-    rows += [row("estimate", seed, 15.0) for seed in range(3)]
-    rows += [row("noisy", seed, 15.0, "of other flights") for seed in range(3)]
+    rows = [measured("rule", None, 10.0)]
+    rows += [measured("truth_on_truth", seed, 20.0) for seed in range(3)]
+    rows += [measured("estimate", seed, 15.0) for seed in range(3)]
+    rows += [measured("noisy", seed, 15.0, "of other flights") for seed in range(3)]
     found, missing = table.lines(task, Rows(rows), Rows(()))
     lines = {line[0]: line for line in found}
     assert lines.keys().isdisjoint(missing)
