@@ -5,6 +5,7 @@ picture's upper left corner.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +248,16 @@ def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
 
     All faces are returned if the eye is inside.
     """
-    shape, center, half, (c, s) = obstacle[0], obstacle[1:4], obstacle[4:7], obstacle[7:]
+    faces, normals, corners = _prism(obstacle.tobytes())
+    turned = ((eye - corners) * normals).sum(axis=1) > 0.0
+    return [face for face, seen in zip(faces, turned, strict=True) if seen] or list(faces)
+
+
+@lru_cache(maxsize=256)  # obstacles stand still, while the eye moves with each picture
+def _prism(row: bytes) -> tuple[tuple[Floats, ...], Floats, Floats]:
+    """Faces of an obstacle, their outward normals (n, 3), and a corner of each (n, 3), in I [m]."""
+    shape, *numbers = np.frombuffer(row)
+    center, half, (c, s) = np.array(numbers[:3]), numbers[3:6], numbers[6:]
     if shape == Shape.CYLINDER:
         angle = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
         level = half[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -258,17 +268,10 @@ def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
         np.column_stack([center[:2] + level, np.full(len(level), center[2] + sign * half[2])])
         for sign in (-1.0, 1.0)
     )
-    sides = [
-        np.stack([low[k], low[j], high[j], high[k]])
-        for k, j in zip(range(len(low)), np.roll(range(len(low)), -1), strict=True)
-    ]
-    faces = [*sides, low, high]
-    seen = [face for face in faces if _faces(face, center, eye)]
-    return seen or faces
-
-
-def _faces(face: Floats, center: Floats, eye: Floats) -> bool:
-    """True if a face of a convex body is turned to the eye."""
-    normal = np.cross(face[1] - face[0], face[2] - face[1])
-    outward = normal * np.sign(normal @ (face.mean(axis=0) - center))
-    return bool(outward @ (eye - face[0]) > 0.0)
+    sides = np.stack([low, np.roll(low, -1, 0), np.roll(high, -1, 0), high], axis=1)
+    faces = (*sides, low, high)
+    corners = np.stack([face[:3] for face in faces])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+    middles = np.stack([face.mean(axis=0) for face in faces])
+    outward = np.sign(((middles - center) * normals).sum(axis=1, keepdims=True))
+    return faces, outward * normals, corners[:, 0]

@@ -279,7 +279,8 @@ class Scene:
         for obstacle in self._scene.obstacles:
             faces = faces_of(obstacle, view.eye)
             # walls are long: use the point that is nearest to the eye
-            distance = min(float(np.linalg.norm(face - view.eye, axis=1).min()) for face in faces)
+            corners = np.concatenate(faces)
+            distance = float(np.linalg.norm(corners - view.eye, axis=1).min())
             if (distance < far) == before_vehicle:
                 chosen.append((distance, faces))
         for _, faces in sorted(chosen, key=lambda one: -one[0]):

@@ -2,16 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from quad_gym import CameraParams
 from quad_gym.envs.config import EnvConfig
 from quad_gym.envs.flights import Flights
 from quad_gym.flights import FlightRecorder
-from quad_gym.records import Autoreset
+from quad_gym.records import Autoreset, Shape
 from quad_gym.rendering.geometry import (
     chase_view,
     ellipsoid_axes,
     ellipsoid_outline,
+    faces_of,
     fit_view,
     fixed_view,
     look_at,
@@ -182,3 +184,25 @@ def test_polygon_behind_the_eye_is_cut_off():
     assert view.outline(floor - (0.0, 20.0, 0.0)).shape == (0, 2)
     before = floor - (0.0, -9.0, 0.0)
     np.testing.assert_array_equal(view.outline(before), view.project(before)[0])
+
+
+def test_faces_of_obstacles_are_those_on_whose_outer_side_the_eye_is():
+    """Half-spaces by SciPy's convex hull of the corners are the reference."""
+    rng, center, half = np.random.default_rng(5), np.array([1.0, -2.0, 3.0]), (0.8, 0.3, 1.2)
+    turned, straight = (np.cos(0.4), np.sin(0.4)), (1.0, 0.0)
+    for shape, turn in ((Shape.WALL, turned), (Shape.CYLINDER, straight)):
+        obstacle = np.array([shape, *center, *half, *turn])
+        every = faces_of(obstacle, center)  # the eye is inside
+        hull = ConvexHull(np.unique(np.concatenate(every).round(12), axis=0))
+        planes = np.unique(hull.equations.round(6) + 0.0, axis=0)
+        assert len(every) == len(planes)
+        for eye in center + rng.normal(0.0, 4.0, (50, 3)):
+            outside = planes[planes[:, :3] @ eye + planes[:, 3] > 0.0]
+            seen = faces_of(obstacle, eye)
+            if not len(outside):
+                assert len(seen) == len(every)
+                continue
+            assert len(seen) == len(outside)
+            for face in seen:  # each lies in one of these planes
+                distance = outside[:, :3] @ face.T + outside[:, 3:]
+                assert (abs(distance).max(axis=1) < 1e-5).sum() == 1
