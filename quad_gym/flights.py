@@ -412,7 +412,13 @@ class Flight:
         return bool(np.isfinite(self.rows["estimated_position"][-1]).all())
 
     def until(self, time: float) -> "Flight":
-        """Return the flight up to a time [s], without copying; at least its first row."""
+        """Return the flight up to a time [s], without copying; at least its first row.
+
+        Raises:
+            ValueError: If the time is NaN.
+        """
+        if np.isnan(time):
+            raise ValueError(f"time must be a number, got {time!r}")
         count = int(np.searchsorted(self.rows["time"], time + 1e-9, side="right"))
         return dataclasses.replace(self, rows=self.rows[: max(count, 1)])
 
@@ -463,8 +469,7 @@ class FlightRecorder:
     def __init__(
         self, batch: FlightBatch, flight: int = 0, about: dict[str, Any] | None = None
     ) -> None:
-        if not 0 <= flight < batch.count:
-            raise ValueError(f"flight must be within 0 and {batch.count - 1}, got {flight}")
+        flight = check.whole("flight", flight, least=0, most=batch.count - 1)
         self._batch, self._which = batch, np.array([flight])
         self._about = dict(about or {})
         camera = batch.sensors.camera

@@ -375,8 +375,11 @@ class FlightBatch(RecordsOfOneForm, FlightMemory):
             flights: Indices of the flights; None: all of them.
 
         Raises:
-            ValueError: If there is no such quantity, or no filter runs that would estimate it.
+            ValueError: If there is no such quantity or flight, or no filter runs that would
+                estimate the quantity.
         """
+        if flights is not None:
+            flights = self._chosen(flights)
         if name in self.randomization.names:
             values = self.drawn()[name]
             return values if flights is None else values[flights]

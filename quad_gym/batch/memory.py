@@ -132,8 +132,10 @@ class FlightMemory:
             flights: Indices of the flights; None: all of them.
 
         Raises:
-            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`.
+            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, or no such flight.
         """
+        if flights is not None:
+            flights = self._chosen(flights)
         if name in _PARTS_OF:
             field, part = _PARTS_OF[name]
             return self.record(field, flights)[(slice(None), *part)]
@@ -149,6 +151,18 @@ class FlightMemory:
             base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
             return in_double(np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base))
         return self._fetched(name, flights)
+
+    def _chosen(self, flights: ArrayLike) -> NDArray[np.intp]:
+        """Return indices of flights, of which all exist; NumPy would take masks and others, too."""
+        found = np.asarray(flights)
+        if not found.size:
+            found = found.astype(np.intp)
+        indices = found.ndim == 1 and found.dtype.kind in "iu"
+        if not indices or (found.size and not 0 <= found.min() <= found.max() < self.count):
+            raise ValueError(
+                f"flights must be indices (n,) from 0 to {self.count - 1}, got {flights!r}"
+            )
+        return found
 
     def _joint_factor(self, flights: NDArray[np.intp] | None) -> NDArray[np.float64]:
         """Return the factors (n, 24, 24) of the covariances of all states, slow errors last."""

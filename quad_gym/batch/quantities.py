@@ -5,6 +5,7 @@ task, the estimators and `FlightBatch.read` have words, the same everywhere. `QU
 only table of both.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -65,7 +66,7 @@ def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:
 
 def _of_rows(turn: Callable[[Floats], Floats], values: Floats, shape: tuple[int, ...]) -> Floats:
     """Attitudes in another form, NaN where a flight has none or has left the finite numbers."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
     good = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
     found = np.full((len(values), *shape), np.nan)
     if good.any():

@@ -53,6 +53,8 @@ def test_rows_are_control_steps_from_the_start():
     np.testing.assert_allclose(flight["time"], np.arange(13) / 100.0, atol=1e-12)
     assert len(flight.until(0.05)) == 6
     assert len(flight.until(-1.0)) == 1
+    with pytest.raises(ValueError, match="time must be a number, got nan"):
+        flight.until(np.nan)
 
 
 def test_recorded_estimate_and_reference_equal_the_observation():
@@ -202,8 +204,9 @@ def test_nothing_is_computed_for_frames_that_are_not_rendered(monkeypatch):
 
 def test_recording_a_missing_flight_raises_value_error():
     env = QuadEnv("hover")
-    with pytest.raises(ValueError, match="flight must be within"):
-        FlightRecorder(env.flights.batch, 1)
+    for flight, message in ((1, "at most 0, got 1"), (-1, "at least 0"), (0.5, "a whole number")):
+        with pytest.raises(ValueError, match=f"flight must be {message}"):
+            FlightRecorder(env.flights.batch, flight)
     with pytest.raises(ValueError, match="reset"):
         _ = FlightRecorder(env.flights.batch).flight
 

@@ -95,6 +95,21 @@ def test_unknown_quantities_are_refused_and_drawn_ones_are_read():
         batch.record("b_a_hut")
 
 
+@pytest.mark.parametrize(
+    "flights", [[3], [-1], np.array([0, 8]), np.array([True, False, True]), [0.5], [[0]], 0, ["a"]]
+)
+@pytest.mark.parametrize("name", ["position", "R_BI", "mass", "features"])
+def test_flights_that_do_not_exist_are_refused(flights, name):
+    """A block holds up to eight flights: NumPy would read from lanes without one."""
+    batch = builders.batch(3, randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
+    assert len(batch.read(name, [2, 0])) == 2
+    assert len(batch.read(name, [])) == 0
+    with pytest.raises(ValueError, match=r"flights must be indices \(n,\) from 0 to 2, got"):
+        batch.read(name, flights)
+    with pytest.raises(ValueError, match=r"flights must be indices \(n,\) from 0 to 2, got"):
+        batch.record("r", flights)
+
+
 def test_estimates_without_a_filter_are_refused():
     batch = FlightBatch(2, source=Source.TRUTH, task=TaskParams(start="hover"))
     batch.reset(seeds=[0, 1])
