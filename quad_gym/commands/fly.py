@@ -107,7 +107,7 @@ def check_options(args: FlyArgs) -> None:
         if ending not in ENDINGS:
             raise ValueError(f"--output must end in one of {', '.join(ENDINGS)}, got {args.output}")
         if ending in VIDEO_ENDINGS:
-            checked_video_path(args.output)
+            checked_video_path(args.output, args.fps)
         require_writable("--output", args.output.parent)
         for file in files_of(args.output, args):
             options.refuse_overwriting(file, args.overwrite)

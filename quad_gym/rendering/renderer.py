@@ -243,6 +243,8 @@ def checked_size(size: tuple[int, int]) -> tuple[int, int]:
 
 def tile(frames: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Return frames of one size in a grid that is as square as possible, padded with white."""
+    if not frames:
+        raise ValueError("frames must be at least one, got none")
     columns = int(np.ceil(np.sqrt(len(frames))))
     rows = -(-len(frames) // columns)
     height, width = frames[0].shape[:2]
@@ -345,6 +347,7 @@ class Rendering:
         self._recorders = [
             FlightRecorder(batch, check.whole("render_flights", i, least=0)) for i in chosen
         ]
+        self._batch = batch
         self._look = check.choice("render_view", view, VIEWS), checked_size(size)
         self._renderers: list[Renderer] = []
         self.frame_rate = batch.clocks.control_rate
@@ -369,6 +372,9 @@ class Rendering:
         """Return pictures of the present instant, one per shown flight."""
         if not self._renderers:
             self._renderers = [Renderer(*self._look) for _ in self._recorders]
+        if not self._batch.begun:  # a snapshot may have been restored
+            for recorder in self._recorders:
+                recorder.keep()
         pairs = zip(self._renderers, self._recorders, strict=True)
         return tuple(renderer.draw(recorder.flight) for renderer, recorder in pairs)
 

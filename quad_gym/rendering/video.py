@@ -21,6 +21,10 @@ from quad_gym.rendering.renderer import Renderer, checked_size, errors_of, legen
 # --------------------------------------------------------------------------------------------------
 
 VIDEO_ENDINGS = (".mp4", ".gif", ".webp")  #: file name endings of the videos that can be written
+_UNITS = {".gif": 10, ".webp": 1}  #: in which these files have the durations of pictures [ms]
+_MOST_FRAMES = 10**6  #: largest number of frames of a video
+_SHORTEST = 20.0
+"""Shortest duration that browsers show in these files [ms]; they replace shorter ones by 100 ms."""
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
@@ -82,8 +86,11 @@ def times_of(
     end: float, fps: float, speed: float, progress: Progress | None = None
 ) -> Iterable[float]:
     """Return the times of the frames of a video [s], the end included."""
-    check.positive("fps", fps)
-    check.positive("speed", speed)
+    if end * fps / check.positive("speed", speed) > _MOST_FRAMES:
+        raise ValueError(
+            f"speed must be at least {end * fps / _MOST_FRAMES:.3g}, with which {end:g} s at "
+            f"{fps:g} frames per second are a video that has {_MOST_FRAMES:,} frames, got {speed:g}"
+        )
     times = np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
     return progress(times) if progress else times
 
@@ -116,7 +123,7 @@ def save_video(
         ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
-    target = checked_video_path(path)
+    target = checked_video_path(path, fps)
     times = times_of(float(flight["time"][-1]), fps, speed, progress)
     renderer = Renderer(view, checked_size(size))
     frames = (renderer.draw(flight.until(t)) for t in times)
@@ -124,11 +131,18 @@ def save_video(
     return target
 
 
-def checked_video_path(path: Path | str) -> Path:
-    """Return the path of a video, if its ending is known and its library installed."""
-    target = Path(path)
-    check.choice("the ending of the video's path", target.suffix.lower(), VIDEO_ENDINGS)
-    module = "imageio_ffmpeg" if target.suffix.lower() == ".mp4" else "PIL.Image"
+def checked_video_path(path: Path | str, fps: float = 25.0) -> Path:
+    """Return the path of a video, if its ending is known and its library installed.
+
+    Args:
+        path: The path.
+        fps: Frames per second, which the format must be able to show.
+    """
+    target, most, rate = Path(path), 1000.0 / _SHORTEST, check.positive("fps", fps)
+    ending = check.choice("the ending of the video's path", target.suffix.lower(), VIDEO_ENDINGS)
+    if ending in _UNITS and rate > most:
+        raise ValueError(f"fps must be at most {most:g} for a {ending} video, got {fps:g}")
+    module = "imageio_ffmpeg" if ending == ".mp4" else "PIL.Image"
     check.package(module, f"a {target.suffix} video", "render")
     return target
 
@@ -197,10 +211,17 @@ def _write_animation(
         path,
         save_all=True,
         append_images=pictures[1:],
-        duration=round(1000.0 / fps),
+        duration=_durations(len(pictures), fps, path.suffix),
         loop=0,
         **options,
     )
+
+
+def _durations(count: int, fps: float, suffix: str) -> list[int]:
+    """Return the durations of pictures [ms], so rounded that their sums keep time."""
+    unit = _UNITS[suffix.lower()]
+    ends = np.round(np.arange(count + 1) * (1000.0 / fps) / unit).astype(int) * unit
+    return [int(duration) for duration in np.diff(ends)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -356,7 +377,7 @@ def save_side_by_side(
         ValueError: If an argument is invalid.
         ImportError: If a library for drawing or writing is not installed.
     """
-    target = checked_video_path(path)
+    target = checked_video_path(path, fps)
     film = SideBySide(sides, speed)
     times = times_of(film.end, fps, speed, progress)
 

@@ -144,6 +144,25 @@ def test_a_new_episode_begins_a_new_trail():
     assert lengths == [2, 3, 4, 5, 6, 1, 2, 3]
 
 
+def test_picture_after_a_restored_snapshot_shows_its_instant():
+    env, fresh = (vec_env(count=1, render_mode="rgb_array", **SMALL) for _ in range(2))
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.ones((1, 4)))
+    (shown,), instant = env.render(), env.flights.batch.snapshot()
+    for _ in range(4):
+        env.step(np.ones((1, 4)))
+    assert (env.render()[0] != shown).any()
+    env.flights.batch.restore(instant)
+    np.testing.assert_array_equal(env.render()[0], shown)
+    fresh.flights.batch.restore(instant)
+    assert fresh.render()[0].shape == shown.shape  # without the trail, which was flown elsewhere
+    assert len(fresh.rendering.flights[0]) == 1
+    np.testing.assert_array_equal(
+        fresh.rendering.flights[0]["position"][-1], env.rendering.flights[0]["position"][-1]
+    )
+
+
 def test_stable_baselines_gets_one_picture_of_all_tiles():
     env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 4, 0, render_mode="rgb_array", **SMALL)
     env.reset()

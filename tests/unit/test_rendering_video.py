@@ -95,6 +95,8 @@ def test_tiles_fill_a_grid():
     assert (sheet[:2, 3:6] == 1).all()
     assert (sheet[2:, 3:6] == 4).all()
     assert (sheet[2:, 6:] == 255).all()
+    with pytest.raises(ValueError, match="frames must be at least one"):
+        tile([])
 
 
 def test_an_mp4_has_the_frames_of_the_flight(flight, tmp_path):
@@ -122,6 +124,21 @@ def test_animations_have_the_frames_of_the_flight(flight, tmp_path, ending):
     assert abs(last - Renderer("fixed", (320, 240)).draw(flight)).mean() < 6.0
 
 
+@pytest.mark.parametrize(("ending", "unit"), [("gif", 10), ("webp", 1)])
+def test_animation_keeps_time_where_its_pictures_last_no_whole_units(
+    flight, tmp_path, ending, unit
+):
+    image = pytest.importorskip("PIL.Image")
+    file = save_video(flight, tmp_path / f"hover.{ending}", size=(320, 240), fps=30.0)
+    lasting = 0
+    with image.open(file) as picture:
+        for k in range(picture.n_frames):
+            picture.seek(k)
+            picture.load()
+            lasting += picture.info["duration"]
+        assert abs(lasting - 1000.0 / 30.0 * picture.n_frames) <= unit
+
+
 @pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
 def test_interrupted_video_leaves_an_earlier_file_unchanged(flight, tmp_path, ending):
     def interrupted(times):
@@ -146,7 +163,11 @@ def test_interrupted_video_leaves_an_earlier_file_unchanged(flight, tmp_path, en
     [
         ("ending", {"path": "hover.avi"}),
         ("fps", {"fps": 0.0}),
+        ("fps must be at most 50 for a .gif video, got 60", {"fps": 60.0}),
+        ("fps must be a number", {"fps": "25"}),
         ("speed", {"speed": -1.0}),
+        ("speed must be at least .* has 1,000,000 frames, got 1e-09", {"speed": 1e-9}),
+        ("speed must be at least .* has 1,000,000 frames", {"fps": 1e12, "path": "hover.mp4"}),
         ("render_view", {"view": "top"}),
         ("render_size", {"size": (321, 240)}),
     ],
