@@ -252,6 +252,17 @@ def latitude(degrees):
     return {"gnss_lat": np.full(4, degrees), "gnss_lon": np.zeros(4), "gnss_alt": np.zeros(4)}
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("step", [0.01, 1.0])
+def test_log_without_any_noise_is_replayed_at_any_rate(step):
+    """Innovations are zero, and samples may be farther apart than the spans of the checks."""
+    rows = np.arange(300)
+    log = {"time": step * rows, "gyro": np.zeros((300, 3)), "gnss_enu": np.zeros((300, 3))}
+    log["accel"] = np.tile([0.0, 0.0, 9.80665], (300, 1))
+    result = replay(log, sensors="consumer", start={"heading": 0.0})
+    assert np.abs(result.position - result.position[0]).max() < 0.1
+
+
 def small(**changes):
     """A log of four rows."""
     time = np.array([0.0, 0.01, 0.02, 0.03])

@@ -121,8 +121,9 @@ def replay(
         raise ValueError("samples must not be given with an estimator of your own")
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
+    length = check.number("window", window, least=0.0)
     whole, suite = prepared(log, sensors, reading)
-    reach = window + max(0.0, *vars(suite.log_delays).values())
+    reach = length + max(0.0, *vars(suite.log_delays).values())
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
         of_part = part, suite, estimator, begin, reported_noise, reach

@@ -376,9 +376,9 @@ def fit_of(measured: InnovationSeries, rows: Any = slice(None)) -> Fit | None:
 
 
 def correlations(scaled: Floats) -> Floats:
-    """Return the correlation of successive innovations (n, axes) by axis."""
-    products = (scaled[:-1] * scaled[1:]).mean(axis=0)
-    return np.asarray(products / (scaled**2).mean(axis=0))
+    """Return the correlation of successive innovations (n, axes) by axis; 0 where all are zero."""
+    products, squares = (scaled[:-1] * scaled[1:]).mean(axis=0), (scaled**2).mean(axis=0)
+    return np.divide(products, squares, out=np.zeros_like(products), where=squares > 0.0)
 
 
 def correlation_time(values: Floats) -> float:

@@ -158,6 +158,7 @@ def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int
     count = 0
     for T in HORIZONS:
         i = np.searchsorted(time, np.arange(time[0], time[-1] - T, 0.25 * T))
+        i = i[i < len(time) - 1]  # samples may be farther apart than T
         j = np.minimum(np.searchsorted(time, time[i] + T), len(time) - 1)
         span = (time[j] - time[i])[:, np.newaxis]
         calm = np.array([hardest[a : b + 1].max() for a, b in zip(i, j, strict=True)]) < IMPACT
