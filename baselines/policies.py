@@ -135,7 +135,7 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
 
 def _gains_of(file: Path) -> PDGains:
     """Read PD gains written by `quad-gym tune`."""
-    if not file.exists():
+    if not file.is_file():
         name = f"pd:{file}"
         raise ValueError(f"there are no gains {file}{check.did_you_mean(name, NAMES)}")
     try:
@@ -156,9 +156,9 @@ def pretrained_file(env_id: str, name: str = _INCLUDED) -> Path:
     if not file.exists():
         known = [task for task in IDS.values() if (PRETRAINED / f"{task}{ending}.npz").exists()]
         what = "no policy" if name == _INCLUDED else f"no policy {name}"
-        raise ValueError(
-            f"{what} is included for {env_id}, only for {', '.join(sorted(known)) or 'no task'}"
-        )
+        others = f", only for {', '.join(sorted(known))}" if known else ""
+        meant = others or check.did_you_mean(name, NAMES)
+        raise ValueError(f"{what} is included for {env_id}{meant}")
     return file
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import NO_CRASHES
@@ -87,15 +88,24 @@ def roll_out(
         Results of each episode. Errors refer to the true position.
 
     Raises:
-        ValueError: If `env` is not a `QuadVectorEnv`, or its episodes have no time limit.
+        ValueError: If `env` is not a `QuadVectorEnv`, or its episodes have no time limit, or do not
+            begin by themselves.
     """
     quads = env.unwrapped
-    if not isinstance(quads, QuadVectorEnv):
-        raise ValueError(f"env must be a QuadVectorEnv, got {type(env).__name__}")
+    if not isinstance(quads, QuadVectorEnv) or hasattr(quads, "device"):
+        raise ValueError(
+            "env must be a QuadVectorEnv, as gymnasium.make_vec makes it, got "
+            f"{type(quads).__name__}"
+        )
     limit, bound = quads.flights.batch.max_steps, quads.flights.batch.task.out_of_bounds
     if limit == 0:
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
     count = env.num_envs
+    if quads.autoreset_mode == AutoresetMode.DISABLED and count > 1:
+        raise ValueError(
+            'env must begin episodes by itself, with autoreset_mode="NextStep" or "SameStep", got '
+            f'"{quads.autoreset_mode.value}"'
+        )
     returns, errors, late, estimation = (np.zeros(count) for _ in range(4))
     lengths, gates = (np.zeros(count, np.int64) for _ in range(2))
     crashed, flying = np.zeros(count, bool), np.ones(count, bool)

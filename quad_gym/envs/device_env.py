@@ -144,7 +144,12 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         return keys_of(np.arange(self.num_envs, dtype=np.uint64) + np.uint64(first))
 
     def write_steps(self, steps: torch.Tensor) -> None:
-        """Set the number of steps of each flight's episode, as `QuadTorchVecEnv.write_steps`."""
+        """Set the number of steps of each flight's episode, as `QuadTorchVecEnv.write_steps`.
+
+        Only the shape is checked: reading the numbers would wait for the GPU.
+        """
+        if tuple(steps.shape) != (self.num_envs,):
+            raise ValueError(f"steps must have shape ({self.num_envs},), got {tuple(steps.shape)}")
         self.batch.write("step", steps.to(self.device, torch.float64))
 
     def step(

@@ -84,7 +84,11 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         """Begin an episode in every flight, with the seeds and options that have been set."""
         seeds = list(self._seeds)
         batch = self.flights.batch
-        start = self._start_values()
+        try:
+            start = self._start_values()
+        except ValueError:
+            self._reset_options()  # which hold for one reset, also where they are refused
+            raise
         begun = self._begun
         if not begun or any(seed is not None for seed in seeds):
             chosen = np.array([not begun or seed is not None for seed in seeds])

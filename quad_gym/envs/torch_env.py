@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 from quad_gym.envs.config import Base
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.params import checks as check
 
 
 class QuadTorchVecEnv(QuadVectorEnv):
@@ -96,9 +97,14 @@ class QuadTorchVecEnv(QuadVectorEnv):
         """Set the number of steps of each flight's episode, (n,), from which its time limit counts.
 
         Reference, sensors and faults keep their time.
+
+        Raises:
+            ValueError: If they are not n whole numbers of at least 0.
         """
-        every = np.arange(self.num_envs)
-        self.flights.batch.write(every, step=_array(steps).astype(np.float64))
+        counts = check.array("steps", _array(steps), (self.num_envs,))
+        if (counts < 0.0).any() or (counts % 1.0).any():
+            raise ValueError(f"steps must be whole numbers of at least 0, got {steps!r}")
+        self.flights.batch.write(np.arange(self.num_envs), step=counts)
 
 
 def checked_device(device: str | torch.device) -> torch.device:

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 import quad_gym
+from baselines import PDPolicy
+from quad_gym.evaluation import roll_out
 
 torch = pytest.importorskip("torch")
 
@@ -59,6 +61,31 @@ def assert_written_steps_move_the_time_limits(envs):
 def test_written_steps_move_the_time_limits():
     made = {"autoreset_mode": "NextStep", **SHORT}
     assert_written_steps_move_the_time_limits(quad_gym.make_torch_vec_env(ENV_ID, 7, **made))
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        (torch.tensor([1, 2, 3]), r"must have shape \(2,\), got \(3,\)"),
+        (torch.tensor(1), r"must have shape \(2,\), got \(\)"),
+        (torch.tensor([1.0, torch.nan]), "must be finite, got nan"),
+        (torch.tensor([1, -1]), "must be whole numbers of at least 0"),
+        (torch.tensor([0.0, 1.5]), "must be whole numbers of at least 0"),
+    ],
+)
+def test_written_steps_that_are_no_counts_change_nothing(steps, message):
+    envs = quad_gym.make_torch_vec_env(ENV_ID, 2, **SHORT)
+    envs.reset(seed=0)
+    before = envs.flights.batch.snapshot().tobytes()
+    with pytest.raises(ValueError, match=f"steps {message}"):
+        envs.write_steps(steps)
+    assert envs.flights.batch.snapshot().tobytes() == before
+
+
+def test_roll_out_refuses_environments_of_tensors():
+    envs = quad_gym.make_torch_vec_env(ENV_ID, 2, **SHORT)
+    with pytest.raises(ValueError, match=r"QuadVectorEnv, .* got QuadTorchVecEnv"):
+        roll_out(PDPolicy(envs), envs)
 
 
 def test_actions_in_bfloat16_are_flown():

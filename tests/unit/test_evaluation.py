@@ -232,6 +232,8 @@ def test_invalid_roll_outs_raise_value_error():
         roll_out(policy, gymnasium.make_vec("Pendulum-v1", num_envs=2))
     with pytest.raises(ValueError, match="time limit"):
         roll_out(policy, QuadVectorEnv(2, "hover", duration=0.0))
+    with pytest.raises(ValueError, match='autoreset_mode="NextStep" or "SameStep", got "Disabled"'):
+        roll_out(policy, QuadVectorEnv(2, "hover", autoreset_mode="Disabled"))
     with pytest.raises(ValueError, match="env_id"):
         evaluate(policy, "QuadGym/Square-v0")
     with pytest.raises(ValueError, match="episodes"):
@@ -252,5 +254,9 @@ def test_policies_trained_on_the_truth_load_by_name():
     assert keywords_of_policy("pretrained:truth", env_id) == {}
     policy = load_policy("pretrained:truth", gymnasium.make_vec(env_id, num_envs=2))
     assert policy.record["plan"]["environment"] == {"observation": "truth"}
+    with pytest.raises(ValueError, match=r"for QuadGym/Hover-v0; did you mean pretrained:t"):
+        load_policy("pretrained:thruth", QuadEnv("hover"))
+    with pytest.raises(ValueError, match="there are no gains"):
+        load_policy("pd:", QuadEnv("hover"))
     with pytest.raises(ValueError, match=r"no policy pretrained:truth is included for QuadGym/Hov"):
         load_policy("pretrained:truth", gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2))
