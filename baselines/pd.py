@@ -187,7 +187,9 @@ class PDPolicy:
         self._widths = policy_size(flights.table), flights.table[-1].slice.stop
         on_course = flights.task.kind == "waypoints"
         usual = 1.0 if on_course else REACH_OF_GAPS if self._gaps else np.inf
-        self._reach = usual if max_position_error is None else max_position_error
+        self._reach = usual
+        if max_position_error is not None:
+            self._reach = check.positive_or_infinite("max_position_error", max_position_error)
 
     def predict(
         self,

@@ -4,6 +4,7 @@ import math
 from dataclasses import KW_ONLY, fields
 from enum import IntEnum
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import numpy as np
@@ -43,7 +44,7 @@ _UNFILTERED = (
 
 def _vehicle(name: str, given: Any) -> VehicleParams:
     return check.instance(
-        name, vehicle_params(given) if isinstance(given, str) else given, VehicleParams
+        name, vehicle_params(given) if isinstance(given, str | Path) else given, VehicleParams
     )
 
 
@@ -131,7 +132,7 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         world: Any = self.world
-        if isinstance(world, str):
+        if isinstance(world, str | Path):
             world = world_params(world, self.flown_vehicle)
         self._set("world", check.instance("world", world, WorldParams))
         check.instance("gains", self.pd_gains, PDGains)

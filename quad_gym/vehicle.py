@@ -63,6 +63,7 @@ def state_derivative(
         ValueError: If an argument has another shape, is not finite, or a voltage is out of range.
     """
     s = checked_state(state)
+    check.instance("params", params, VehicleParams)
     ea = check.array("voltages", voltages, (4,))
     d_I = check.array("disturbance_I", disturbance_I, (3,))
     if (ea < 0.0).any() or (ea > params.max_voltage).any():

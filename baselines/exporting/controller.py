@@ -125,7 +125,7 @@ class Controller:
 
 
 def controller_of(
-    policy: str,
+    policy: str | Path,
     env_id: str | None = None,
     keywords: Mapping[str, Any] | None = None,
     normalization: Any = None,
@@ -145,6 +145,7 @@ def controller_of(
             modules or files, which are used only if `env_id` or `keywords` name them.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
     """
+    policy = str(policy)
     if policy == "pd" or policy.startswith("pd:"):
         raise ValueError(f"policy must be a trained network, got {policy!r}")
     if is_included(policy) and env_id is None:

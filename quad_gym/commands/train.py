@@ -84,6 +84,8 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     plan.make_judge().close()
     require_model(plan)
     require_writable("--output", folder)
+    if args.export is not None:
+        require_writable("--export", args.export.parent)
     return plan, folder
 
 

@@ -658,7 +658,7 @@ def sensor_suite(name: str | Path) -> SensorSuite:
 
 def given_suite(name: str, given: Any) -> SensorSuite:
     """Return a suite that is given as one or by its name, under the name of the argument."""
-    suite = sensor_suite(given) if isinstance(given, str) else given
+    suite = sensor_suite(given) if isinstance(given, str | Path) else given
     return check.instance(name, suite, SensorSuite)
 
 

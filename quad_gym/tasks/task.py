@@ -70,7 +70,8 @@ class FlightRandom:
             ValueError: If the first axis has another length.
         """
         count = len(self._instants)
-        shape = (count,) if size is None else (size,) if isinstance(size, int) else tuple(size)
+        size = count if size is None else size
+        shape = (int(size),) if isinstance(size, int | np.integer) else tuple(size)
         if not shape or shape[0] != count:
             raise ValueError(f"size must begin with the number of flights, {count}, got {size}")
         columns = math.prod(shape[1:])

@@ -174,6 +174,12 @@ def test_policy_for_another_environment_is_refused():
         load_policy("pretrained", gymnasium.make("CartPole-v1"))
 
 
+@pytest.mark.parametrize("error", [0.0, -1.0, np.nan, "1"])
+def test_limit_of_position_errors_that_is_not_positive_is_refused(error):
+    with pytest.raises(ValueError, match="max_position_error must be"):
+        PDPolicy(QuadEnv("hover"), max_position_error=error)
+
+
 @pytest.mark.parametrize("action", ["motor", "wrench", "ctbr", "attitude"])
 def test_low_control_rate_without_inner_loop_gives_warning(action):
     with warnings.catch_warnings(record=True) as caught:

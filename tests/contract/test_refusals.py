@@ -29,6 +29,7 @@ REFUSED = [
     ("circle --nonsense 3", "quad-gym circle --help"),
     ("train --algorithm pp", "invalid choice 'pp' for argument '--algorithm'"),
     ("train --output /dev/null/run", "cannot write to --output"),
+    ("train --export /dev/null/policy.npz", "cannot write to --export"),
     ("train --steps 0", "--steps must be at least 1, got 0"),
     ("train --evaluations 0", "evaluations must be at least 1"),
     ("train --export policy.txt", "--export must end in .npz, got policy.txt"),

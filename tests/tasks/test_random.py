@@ -61,6 +61,12 @@ def test_methods_instants_and_calls_draw_different_numbers():
     assert len(np.unique(np.concatenate(drawn))) == 16
 
 
+@pytest.mark.parametrize("size", [4, np.int64(4), np.array(4)[()], [4], (np.int8(4), 2)])
+def test_sizes_of_any_integer_type_are_accepted(size):
+    expected = np.random.default_rng(0).random(size).shape
+    assert generator(4).random(size).shape == expected
+
+
 def test_invalid_sizes_and_names_are_refused():
     with pytest.raises(ValueError, match="size must begin with the number of flights, 4, got"):
         generator(4).normal(size=3)

@@ -169,7 +169,7 @@ def test_c_has_every_activation_and_odd_sizes(activation, tmp_path):
     biases = [rng.normal(0, 0.4, o).astype(np.float32) for o in sizes[1:]]
     policy = MlpPolicy(weights, biases, [activation] * 3, {})
     policy.save(tmp_path / "policy.npz")
-    controller = controller_of(str(tmp_path / "policy.npz"), CIRCLE)
+    controller = controller_of(tmp_path / "policy.npz", CIRCLE)
     seen = rng.standard_normal((200, 28)).astype(np.float32).clip(*controller.bounds)
     actions, _ = compiled(controller, tmp_path)(seen)
     np.testing.assert_allclose(actions, policy.predict(seen)[0], rtol=0.0, atol=2e-6)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -131,6 +132,15 @@ def test_binary_missing_and_wrongly_named_files_are_refused(tmp_path):
         quad_gym.sensor_suite("rtk").save("mine.txt")
     with pytest.raises(ValueError, match=r"or a file of a suite \(.toml\), got 'consumr'; did you"):
         quad_gym.sensor_suite("consumr")
+
+
+def test_environments_take_paths_of_files(tmp_path):
+    suite, vehicle = quad_gym.sensor_suite("rtk"), quad_gym.vehicle_params("crazyflie")
+    world = quad_gym.WorldParams(wind_I=(1.0, 0.0, 0.0))
+    given = {"sensors": suite, "vehicle": vehicle, "world": world}
+    paths = {name: params.save(tmp_path / f"{name}.toml") for name, params in given.items()}
+    batch = gymnasium.make("QuadGym/Hover-v0", **paths).unwrapped.flights.batch
+    assert {name: getattr(batch, name) for name in given} == given
 
 
 def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys):

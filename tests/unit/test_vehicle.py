@@ -109,6 +109,8 @@ def test_bad_voltages_and_disturbances_are_refused():
     for force in ([1.0, 2.0], np.full(3, np.nan), None):
         with pytest.raises(ValueError, match=r"^disturbance_I must"):
             state_derivative(at_rest(), np.zeros(4), force, LAB)
+    with pytest.raises(ValueError, match=r"^params must be a VehicleParams, got 'lab'"):
+        state_derivative(at_rest(), np.zeros(4), NO_FORCE, "lab")
 
 
 @pytest.mark.parametrize("name", sorted(at_rest()))
