@@ -19,6 +19,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,7 +146,8 @@ def write_tables(parts: Sequence[Part], root: Path, *, partial: bool) -> list[Pa
         if not partial:
             rows = tables(cells_of(complete, root)).get(table)
         if rows is not None:
-            rows.write(DATA / f"{table}.csv")
+            with FileLock(root / "tables.lock"):  # two processes may complete a part at once
+                rows.write(DATA / f"{table}.csv")
             written.append(DATA / f"{table}.csv")
     return written
 
@@ -183,13 +185,9 @@ def take_over(cells: Sequence[Cell]) -> int:
     return count
 
 
-def work(cells: Sequence[Cell], limit: int | None = None) -> bool:
-    """Complete cells one after the other, except for those in work elsewhere.
-
-    Returns:
-        True if none is left that another process works on.
-    """
-    count, elsewhere = 0, False
+def work(cells: Sequence[Cell], limit: int | None = None) -> None:
+    """Complete cells one after the other, except for those in work elsewhere."""
+    count = 0
     for cell in cells:
         if cell.row is not None:
             continue
@@ -198,19 +196,15 @@ def work(cells: Sequence[Cell], limit: int | None = None) -> bool:
         # arms that fly the policies of another share its training, and so its lock
         where = cell.file.parent if cell.training is None else cell.training.folder
         where.mkdir(parents=True, exist_ok=True)
-        try:
-            with FileLock(where / "cell.lock", timeout=0):
-                if cell.row is None:
-                    row = cell.run()
-                    count += 1
-                    print(
-                        f"{cell.name}: success {row['success']:.1%}, crashed "
-                        f"{row['crashed']:.1%}; {hours_left(cells):.1f} core hours left",
-                        flush=True,
-                    )
-        except Timeout:
-            elsewhere = True
-    return not elsewhere
+        with suppress(Timeout), FileLock(where / "cell.lock", timeout=0):
+            if cell.row is None:
+                row = cell.run()
+                count += 1
+                print(
+                    f"{cell.name}: success {row['success']:.1%}, crashed "
+                    f"{row['crashed']:.1%}; {hours_left(cells):.1f} core hours left",
+                    flush=True,
+                )
 
 
 def main(args: RunArgs) -> int:
@@ -231,7 +225,9 @@ def main(args: RunArgs) -> int:
     helpers = [subprocess.Popen(_words(args)) for _ in range(args.jobs - 1)]
     try:
         for part in parts:
-            if work(cells_of([part], args.output, args.seeds), args.cells):
+            cells = cells_of([part], args.output, args.seeds)
+            work(cells, args.cells)
+            if all(cell.row is not None for cell in cells):
                 write_tables([part], args.output, partial=False)
         for helper in helpers:
             helper.wait()
