@@ -99,18 +99,15 @@ def _line(label: str, track: str, rows: Rows, ends: tuple[float, float] | None) 
 
 
 def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
-    """Heading, question and table of a task, and the rows that it lacks."""
+    """Heading, question and table of a task; rows that are not measured have no seeds."""
     question = task.asks if task.asks.endswith("?") else f"{task.asks}."
     body, missing = lines(task, measured, entered)
     parts = [f"### {task.name}", question]
     if body:
+        body += [[label, "", "none", *[""] * (len(HEADS) - 3)] for label in missing]
         parts.append(markdown_table(HEADS, body, texts=2))
-    if not body:
+    else:
         parts.append("No row is measured with the present flights yet.")
-    elif missing:
-        parts.append(
-            f"These rows are not measured with the present flights yet: {'; '.join(missing)}."
-        )
     return "\n\n".join(parts)
 
 
