@@ -297,6 +297,8 @@ def load_flight(path: Path) -> tuple[NDArray[Any], FlightScene, dict[str, Any]]:
     except ValueError as error:
         if "not a flight" in str(error):
             raise
+        if "pickle" in str(error):  # what NumPy assumes any other file to be
+            raise ValueError(f"{path} is not a flight: it is no archive of arrays") from None
         raise ValueError(f"{path} is not a flight, or damaged: {error}") from None
     header = _header(path, entries)
     try:

@@ -33,6 +33,7 @@ from quad_gym.analysis.metrics import (
     state_error,
 )
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.task import TaskParams
 from quad_gym.rotations import quaternion_to_dcm
@@ -372,6 +373,7 @@ class Findings:
         return said
 
 
+EVERY = 0.05  #: evaluation interval of errors, and least length of flights [s]
 ASTRAY = 5.0  #: distance from the reference beyond which a flight counts as lost [m]
 
 
@@ -380,7 +382,7 @@ def measure_consistency(
     *,
     seeds: Sequence[int],
     duration: float,
-    every: float = 0.05,
+    every: float = EVERY,
     settle: float = 0.0,
     progress: Callable[[float], Any] = lambda time: None,
 ) -> Findings:
@@ -396,11 +398,10 @@ def measure_consistency(
         progress: Function called repeatedly with the time flown so far [s].
 
     Raises:
-        ValueError: If `duration` or `every` is not positive, or the control rate of the batch is
-            not its IMU rate.
+        ValueError: If `every` is not positive, `duration` is shorter, or the control rate of the
+            batch is not its IMU rate.
     """
-    if not (duration > 0.0 and every > 0.0):
-        raise ValueError(f"duration and every must be above 0, got {duration} and {every}")
+    check.number("duration", duration, least=check.positive("every", every))
     if batch.clocks.ticks_per_step != 1:
         raise ValueError("batch must be controlled at its IMU rate, so that no sample is missed")
     dt = batch.sensors.imu.dt

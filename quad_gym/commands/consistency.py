@@ -29,6 +29,7 @@ from quad_gym import FilterParams, SensorSuite, sensor_suite
 from quad_gym.analysis.consistency import (
     BAND_FLIGHTS,
     CONSISTENT_SHARE,
+    EVERY,
     PARTS,
     Findings,
     MeanSquare,
@@ -269,8 +270,8 @@ class ConsistencyArgs:
         options.require_at_least(self, episodes=2, seed=0, threads=1)
         full_id = options.known_id("ENV_ID", self.env_id, options.TRACKING)
         object.__setattr__(self, "env_id", full_id)
-        for name in ("duration", "noise_factor"):
-            check.positive(options.option_name(name), getattr(self, name))
+        check.number("--duration", self.duration, least=EVERY)
+        check.positive("--noise-factor", self.noise_factor)
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
         if self.own_estimator is not None and self.form != "suite":

@@ -19,6 +19,7 @@ from quad_gym.commands.options import (
     Keywords,
     Normalized,
     full_id,
+    leave,
     refuse_overwriting,
     usage_errors,
 )
@@ -95,6 +96,7 @@ def export(args: ExportPolicyArgs, file: Path) -> str:
     from baselines.exporting import c_source, controller_of, save_onnx
 
     env_id = None if args.env_id is None else full_id(args.env_id)
+    leave(args.env)
     controller = controller_of(args.policy, env_id, args.env or None, args.normalization)
     if args.to == "onnx":
         error = save_onnx(controller, file)

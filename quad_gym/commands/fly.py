@@ -127,6 +127,8 @@ def make_env(args: FlyArgs) -> Any:
             start, end = args.fault_time
             timed = {"start": start, "duration": end - start, "rate": 0.0}
             faults = tuple(fault.replace(**timed) for fault in faults)
+        if args.fault_time is not None and not faults:
+            raise ValueError("--fault-time needs --faults other than none")
         keywords["faults"] = faults
     return gymnasium.make_vec(args.env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
 

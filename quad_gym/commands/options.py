@@ -214,11 +214,19 @@ def usage_errors(
         raise SystemExit(USAGE_ERROR) from None
 
 
+_OF_COMMANDS = ("num_envs", "autoreset_mode", "render_mode")
+"""Arguments of vector environments that are no keywords of `--env`."""
+
+
 def leave(keywords: Mapping[str, Any], *names: str, **others: str) -> Mapping[str, Any]:
     """Check that `--env` contains no keyword for which there is an option, of this name or another.
 
-    `others` has options with other names than their keywords.
+    Arguments that commands choose are refused, too. `others` has options with other names than
+    their keywords.
     """
+    for name in _OF_COMMANDS:
+        if name in keywords:
+            raise ValueError(f"--env must not contain {name}, which the command chooses")
     for name, instead in {**{name: option_name(name) for name in names}, **others}.items():
         if name in keywords:
             raise ValueError(f"--env must not contain {name}: use {instead} instead")
