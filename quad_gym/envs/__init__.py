@@ -53,8 +53,12 @@ def register_task(
     """
     require_known(keywords)
     check.choice("base", base, tuple(IDS))
-    if env_id in IDS:
+    if not isinstance(env_id, str) or env_id in IDS:
         raise ValueError(f"env_id must be a new one, got {env_id!r}")
+    if not isinstance(task, str):  # a module is imported when an environment is made
+        from quad_gym.tasks.task import resolve_task
+
+        resolve_task(task)
     kwargs = {"base": (IDS[base], task), **keywords}
     register(env_id, **_ENTRY_POINTS, kwargs=kwargs)  # type: ignore[arg-type]
 

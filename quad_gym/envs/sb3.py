@@ -189,7 +189,7 @@ class QuadSB3VecEnv(Rendered, VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of this environment once per index: all flights share it."""
-        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+        return [getattr(self, attr_name) for _ in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set `metadata`, or an attribute that you have added; it is shared by all flights.
@@ -198,7 +198,7 @@ class QuadSB3VecEnv(Rendered, VecEnv):
             ValueError: If `indices` leaves out flights, there is no such attribute, or it is one of
                 this class: keywords of `make_sb3_vec_env` determine these.
         """
-        if len(list(self._get_indices(indices))) != self.num_envs:
+        if len(self._chosen(indices)) != self.num_envs:
             raise ValueError("indices must be None: the flights share their attributes")
         if not hasattr(self, attr_name):
             raise ValueError(
@@ -215,8 +215,9 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **keywords: Any
     ) -> list[Any]:
         """Call a method of this environment once, and return its result once per index."""
+        chosen = self._chosen(indices)
         result = getattr(self, method_name)(*args, **keywords)
-        return [result for _ in self._get_indices(indices)]
+        return [result for _ in chosen]
 
     def env_is_wrapped(
         self,
@@ -226,7 +227,14 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         """Return True for `Monitor`, whose records are built in; no flight has a wrapper."""
         from stable_baselines3.common.monitor import Monitor
 
-        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+        return [wrapper_class is Monitor for _ in self._chosen(indices)]
+
+    def _chosen(self, indices: VecEnvIndices) -> list[int]:
+        """Return the indices of flights that the caller has chosen; None: all."""
+        found = list(self._get_indices(indices))
+        if not all(-self.num_envs <= i < self.num_envs for i in found):
+            raise ValueError(f"indices must be below {self.num_envs}, got {indices!r}")
+        return found
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return a frame of each flight that is rendered."""

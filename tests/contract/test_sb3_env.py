@@ -148,6 +148,11 @@ def test_attributes_and_methods_are_shared_by_all_flights():
             env.set_attr(name, 1)
     assert env.env_is_wrapped(Monitor) == [True] * 3
     assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=1) == [False]
+    for indices in (3, [0, 5], -4):
+        with pytest.raises(ValueError, match="indices must be below 3, got"):
+            env.get_attr("num_envs", indices)
+        with pytest.raises(ValueError, match="indices must be below 3, got"):
+            env.env_method("seed", 1, indices=indices)
     env.close()
     env.close()
 

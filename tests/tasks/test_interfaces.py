@@ -48,6 +48,12 @@ def test_registered_id_works_in_all_interfaces(registered):
 def test_registration_refuses_wrong_ids():
     with pytest.raises(ValueError, match="env_id must be a new one"):
         quad_gym.register_task("QuadGym/Hover-v0", Chase)
+    for wrong in (3, None):
+        with pytest.raises(ValueError, match="env_id must be a new one"):
+            quad_gym.register_task(wrong, Chase)
+        with pytest.raises(ValueError, match=r"task must be a quad_gym\.Task"):
+            quad_gym.register_task("Mine/Chase-v0", wrong)
+    assert "Mine/Chase-v0" not in gymnasium.registry
     with pytest.raises(ValueError, match="base must be one of"):
         quad_gym.register_task("Mine/Chase-v0", Chase, "CartPole-v1")
     for wrong in ("circle", "circel", "QuadGym/Cirle-v0", "quadgym/circle-v0"):
