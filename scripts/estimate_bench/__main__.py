@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from scripts.estimate_bench import entries
-from scripts.estimate_bench.table import ENTRIES, table
+from scripts.estimate_bench.table import ENTRIES, texts
 from scripts.studies.campaign import EPISODES, FIRST_EPISODE
 
 
@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         tables = ("estimate_bench",)
         return campaign.main(campaign.RunArgs(tables=tables, jobs=args.jobs, list=args.list))
     if args.command == "table":
-        print(table())
+        print(texts()["benchmark.table"])
         return 0
     if args.command == "fly":
         try:

@@ -55,6 +55,13 @@ def write_linear(file, memory=False):
     onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), str(file))
 
 
+def test_command_prints_the_table_of_the_page(capsys):
+    assert command.main(["table"]) == 0
+    printed = capsys.readouterr().out
+    assert all(task.name in printed for task in TASKS)
+    assert printed.strip() == table.texts()["benchmark.table"].strip()
+
+
 def test_entry_is_flown_and_equal_in_every_digit_until_one_is_changed(tmp_path, capsys):
     folder = write_entry(tmp_path / "linear")
     assert command.main(["check", str(folder)]) == 1
