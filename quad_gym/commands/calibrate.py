@@ -18,7 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    SuiteName,
+    heading_in_degrees,
+    refuse_overwriting,
+    usage_errors,
+)
 from quad_gym.commands.replay import MISFIT, LogFiles, ReadingArgs, capital, told
 
 if TYPE_CHECKING:
@@ -225,9 +230,11 @@ def starts_of(args: CalibrateArgs) -> list[dict[str, Any]]:
     if args.heading is not None:
         headings = args.heading * (len(starts) if len(args.heading) == 1 else 1)
         if len(headings) != len(starts):
-            raise ValueError(f"--heading must be given for each of {len(starts)} logs")
+            raise ValueError(
+                f"--heading must be given for each of {len(starts)} logs, got {len(headings)}"
+            )
         for start, heading in zip(starts, headings, strict=True):
-            start["heading"] = math.radians(heading)
+            start["heading"] = math.radians(heading_in_degrees("--heading", heading))
     return starts
 
 

@@ -27,6 +27,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from quad_gym.envs import IDS
 from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS, TASK_KEYWORDS, EnvConfig
+from quad_gym.params import checks as check
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
@@ -244,6 +245,11 @@ def environment_of(args: Any, **given: Any) -> dict[str, Any]:
     leave(args.env, *own, *(name for name in ("threads",) if name in every))
     changed = {name: getattr(args, name) for name in own if getattr(args, name) != every[name]}
     return {**args.env, **changed, **given}
+
+
+def heading_in_degrees(option: str, value: float) -> float:
+    """Return the heading of an option, if it is at most a turn [deg]."""
+    return check.number(option, value, least=-360.0, most=360.0)
 
 
 def refuse_overwriting(file: Path, overwrite: bool) -> None:

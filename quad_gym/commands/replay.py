@@ -22,7 +22,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import numpy as np
 from tyro.conf import Positional, arg
 
-from quad_gym.commands.options import Keywords, LogSuite, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    Keywords,
+    LogSuite,
+    heading_in_degrees,
+    refuse_overwriting,
+    usage_errors,
+)
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Reading, Replay
@@ -179,9 +185,10 @@ def start_of(args: ReplayArgs) -> dict[str, Any]:
     """Arguments for the start of the filter, from the options."""
     start: dict[str, Any] = {"course": True} if args.course else {}
     if args.heading is not None:
-        start["heading"] = math.radians(args.heading)
+        start["heading"] = math.radians(heading_in_degrees("--heading", args.heading))
     if args.heading_from_north is not None:
-        start["heading"] = math.radians(90.0 - args.heading_from_north)
+        north = heading_in_degrees("--heading-from-north", args.heading_from_north)
+        start["heading"] = math.radians(math.remainder(90.0 - north, 360.0))
     if args.start_position is not None:
         start["position"] = args.start_position
     return start

@@ -66,10 +66,22 @@ def test_heading_from_north_is_the_heading_of_a_compass(table, tmp_path):
     log = written({k: v for k, v in table.items() if k != "magnetometer"}, tmp_path / "a.csv")
     words = [log, "--no-figure", "--overwrite"]
     estimates = []
-    for options in (["--heading", "17"], ["--heading-from-north", "73"]):
+    north = "--heading-from-north"
+    for options in (["--heading", "17"], [north, "73"], [north, "-287"]):
         run("replay", *words, *options, "--output", tmp_path / "out")
         estimates.append((tmp_path / "out" / "estimates.csv").read_text())
-    assert estimates[0] == estimates[1]
+    assert len(set(estimates)) == 1
+
+
+@pytest.mark.parametrize("option", ["--heading", "--heading-from-north"])
+@pytest.mark.parametrize(
+    ("value", "message"), [("720", "at most 360, got 720"), ("nan", "finite"), ("-361", "at least")]
+)
+def test_heading_beyond_a_turn_is_refused_in_degrees(option, value, message, tmp_path, capsys):
+    assert f"{option} must be {message}" in refused(f"replay a.csv {option} {value}", capsys)
+    if option == "--heading":
+        words = f"calibrate a.csv --output {tmp_path} {option} {value}"
+        assert f"{option} must be {message}" in refused(words, capsys)
 
 
 def test_two_headings_are_refused_with_both_conventions(tmp_path, capsys):
