@@ -23,7 +23,8 @@ def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.flo
         wanted = ", ".join(str(n) for n in shape)
         raise ValueError(f"{name} must have shape (..., {wanted}), got {array.shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite")
+        wrong = array[~np.isfinite(array)].flat[0]
+        raise ValueError(f"{name} must be finite, got {wrong} among its values")
     return array
 
 

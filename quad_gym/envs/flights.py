@@ -153,7 +153,8 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     if numbers.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {numbers.shape}")
     if not np.isfinite(numbers).all():
-        raise ValueError("action must be finite: it contains NaN or infinity")
+        place = tuple(np.argwhere(~np.isfinite(numbers))[0].tolist())
+        raise ValueError(f"action must be finite, got {numbers[place]} at {list(place)}")
     return numbers.clip(-1.0, 1.0)
 
 

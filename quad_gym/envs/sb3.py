@@ -249,6 +249,10 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         if not names:
             return {}
         if any(set(options) != names for options in chosen):
-            raise ValueError("options must contain the same names for every environment")
+            given = sorted({", ".join(sorted(options)) or "none" for options in chosen})
+            raise ValueError(
+                "options must contain the same names for every environment, got "
+                + " and ".join(given)
+            )
         start = {name: np.array([options[name] for options in chosen]) for name in names}
         return self.flights.start(start)

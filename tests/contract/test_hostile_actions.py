@@ -84,6 +84,8 @@ def test_invalid_action_of_one_flight_refuses_step_of_all_flights(interface):
     actions[1, 2] = np.nan
     env = make(interface)
     refuses(env, actions)
+    with pytest.raises(ValueError, match=r"action must be finite, got nan at \[1, 2\]"):
+        env.step(actions)
     assert_same(env.step(np.zeros((COUNT, 4)))[0], make(interface).step(np.zeros((COUNT, 4)))[0])
 
 

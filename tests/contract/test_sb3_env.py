@@ -105,6 +105,9 @@ def test_options_hold_for_the_next_reset_only():
         env.reset()
     assert state_of(env) == before
     env.reset()  # without the options, which were refused
+    env.set_options([{"yaw": 1.0}, {}, {"yaw": 1.0, "position": [4.0, 0.0, 1.5]}])
+    with pytest.raises(ValueError, match=r"the same names .* got none and position, yaw and yaw"):
+        env.reset()
 
 
 def test_results_have_stated_types_and_share_no_memory():
