@@ -51,7 +51,13 @@ def write_films(app: Sphinx) -> None:
     ):
         film = folder / f"{kind}.webp"
         options = FlyArgs(
-            env_id=env_id, policy=policy_of(env_id), size=SIZE, speed=SPEED, fps=RATE, output=film
+            env_id=env_id,
+            policy=policy_of(env_id),
+            size=SIZE,
+            speed=SPEED,
+            fps=RATE,
+            output=film,
+            overwrite=True,  # of an earlier build
         )
         fly.main(options)
         film.with_suffix(".npz").unlink()
