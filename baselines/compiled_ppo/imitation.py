@@ -8,16 +8,16 @@ is fitted to all answers so far.
 
 import importlib
 import pickle
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.ppo import Networks, as_floats, record_for, sizes_of
-from baselines.mlp import FUNCTIONS, MlpPolicy
+from baselines.compiled_ppo.networks import Networks
+from baselines.compiled_ppo.training import STATE, NetworkTraining, as_floats, sizes_of
+from baselines.mlp import FUNCTIONS
 from baselines.policies import NAMES, load_policy
 from baselines.recipes import IMITATION, Recipe
 from quad_gym.evaluation import Policy
@@ -29,8 +29,6 @@ flight in a round, size of a minibatch, and number of minibatches after each rou
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8  #: parameters of Adam
 
-_EPISODES = 100  #: number of latest episodes whose mean return is `training_return`
-
 _SLOPES: dict[str, Any] = {
     "relu": lambda y: y > 0.0,
     "tanh": lambda y: 1.0 - y * y,
@@ -39,7 +37,7 @@ _SLOPES: dict[str, Any] = {
 """Derivatives of activations, as functions of their results."""
 
 
-class Imitation:
+class Imitation(NetworkTraining):
     """Training of a network by a teacher that knows what to do in every state (DAgger).
 
     In each round all flights continue for some steps. At first the teacher flies all of them; the
@@ -75,84 +73,34 @@ class Imitation:
         env_seed: int | None = None,
     ) -> None:
         inputs, outputs = sizes_of(env)
-        self.parameters = _checked(recipe)
-        self.env, self.recipe, self.num_timesteps = env, recipe, 0
-        self.losses: dict[str, float] = {}
+        super().__init__(env, recipe, _checked(recipe), seed, env_seed)
         self._teacher = teacher or teacher_of(self.parameters["teacher"], env)
-        self._columns = _checked_columns(range(inputs) if columns is None else columns, inputs)
-        self._env_seed = seed if env_seed is None else env_seed
-        self._rng = np.random.default_rng(seed)
-        self.networks = Networks(len(self._columns), outputs, recipe, self._rng)
+        self._observed = _checked_columns(range(inputs) if columns is None else columns, inputs)
+        count = len(self._observed)
+        self._sees_all = count == inputs
+        self.networks = Networks(count, outputs, recipe, self._rng)
         size = self.networks.params.size
         self._gradient, self._moments = np.zeros(size, np.float32), np.zeros((2, size), np.float32)
         self._descents = 0
-        self._observations = np.zeros((0, len(self._columns)), np.float32)
+        self._observations = np.zeros((0, count), np.float32)
         self._answers = np.zeros((0, outputs), np.float32)
-        self._seen: NDArray[np.float32] | None = None
         self._memory: Any = None
         self._starts = np.ones(env.num_envs, bool)
-        self._returns, self._finished = np.zeros(env.num_envs), deque[float](maxlen=_EPISODES)
 
-    def learn(
-        self,
-        steps: int,
-        watch: Callable[["Imitation"], bool] | None = None,
-        *,
-        quiet: bool = False,
-    ) -> None:
-        """Train until a total number of environment steps, summed over all flights, is reached.
+    def _round(self, steps: int) -> None:
+        self._roll_out(max(0.0, 1.0 - 2.0 * self.num_timesteps / steps))
+        self._fit(self._rate(max(0.0, 1.0 - self.num_timesteps / steps)))
 
-        The last round is completed. `watch` is called between rounds; the training stops if it
-        returns False. `quiet` hides the progress bar.
-        """
-        from tqdm.auto import tqdm
+    def _progress(self) -> str:
+        return f"error {self.losses['squared_error']:.4f}"
 
-        self.prepare()
-        first, last = self.recipe.learning_rate
-        begun = min(self.num_timesteps, steps)
-        look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": quiet}
-        with tqdm(total=steps, initial=begun, **look) as bar:
-            while self.num_timesteps < steps and (watch is None or watch(self)):
-                self._roll_out(max(0.0, 1.0 - 2.0 * self.num_timesteps / steps))
-                remaining = max(0.0, 1.0 - self.num_timesteps / steps)
-                self._fit(last + (first - last) * remaining)
-                bar.set_postfix_str(f"error {self.losses['squared_error']:.4f}", refresh=False)
-                bar.update(min(self.num_timesteps, steps) - bar.n)
-
-    def prepare(self) -> None:
-        """Begin the first episodes, and compile all kernels."""
-        if self._seen is None:
-            self._seen = as_floats(self.env.reset(seed=self._env_seed)[0])
+    def _compile(self, seen: NDArray[np.float32]) -> None:
         self.networks.flip()
-        self.networks.evaluate(self._seen[:1, self._columns])
+        self.networks.evaluate(seen[:1, self._observed])
 
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
-        """Return actions for observations (..., n) of the network, or the whole ones (..., m)."""
-        policy, x = self.networks.policy({}), np.asarray(observation, np.float32)
-        fits = x.shape[-1:] == (policy.inputs,)
-        return policy.predict(x if fits else x[..., self._columns], state, episode_start)
-
-    def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
-        """Copy the present policy to one that requires only NumPy.
-
-        Its record defaults to the observations, actions and control rate of the training if the
-        network observes everything, so that `load_policy` refuses environments with others.
-        """
-        whole = self._seen is None or len(self._columns) == self._seen.shape[1]
-        if record is None:
-            record = record_for(self.env) if whole else {}
-        return self.networks.policy(record)
-
-    @property
-    def training_return(self) -> float:
-        """Mean return of the latest episodes, not scaled; NaN before the first."""
-        return float(np.mean(self._finished)) if self._finished else float("nan")
+    def _record(self) -> dict[str, Any]:
+        """Record of the training, if the network observes everything; otherwise none."""
+        return super()._record() if self._sees_all else {}
 
     def state(self) -> bytes:
         """Serialize the state of the training and an environment of quad_gym, to resume exactly."""
@@ -186,19 +134,13 @@ class Imitation:
             wanted, self._memory = self._teacher.predict(
                 self._seen, state=self._memory, episode_start=self._starts, deterministic=True
             )
-            x = np.ascontiguousarray(self._seen[:, self._columns])
+            x = np.ascontiguousarray(self._seen[:, self._observed])
             observations.append(x)
             answers.append(as_floats(wanted))
             action = np.where(taught, wanted, self.networks.evaluate(x)[0])
             action = action + spread * self._rng.standard_normal(action.shape, np.float32)
-            seen, reward, terminated, truncated, _ = self.env.step(
-                action.clip(-1.0, 1.0).astype(np.float32)
-            )
-            self._seen, self._starts = as_floats(seen), terminated | truncated
-            self._returns += reward
-            self._finished += self._returns[self._starts].tolist()
-            self._returns[self._starts] = 0.0
-        self.num_timesteps += count * self.parameters["n_steps"]
+            _, terminated, truncated, _ = self._step(action.clip(-1.0, 1.0).astype(np.float32))
+            self._starts = terminated | truncated
         self._observations = np.concatenate(observations)
         self._answers = np.concatenate(answers)
 
@@ -242,20 +184,7 @@ class Imitation:
         self.networks.params -= np.float32(rate / first) * mean / spread
 
 
-_STATE = (
-    "num_timesteps",
-    "losses",
-    "_rng",
-    "_moments",
-    "_descents",
-    "_observations",
-    "_answers",
-    "_seen",
-    "_memory",
-    "_starts",
-    "_returns",
-    "_finished",
-)
+_STATE = (*STATE, "_moments", "_descents", "_observations", "_answers", "_memory", "_starts")
 """Attributes of the state of a training, in addition to the network and the environment."""
 
 

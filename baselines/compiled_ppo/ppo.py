@@ -1,21 +1,16 @@
 """`CompiledPPO`: proximal policy optimization without torch, for vector environments."""
 
 import pickle
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from baselines.compiled_ppo import kernels
-from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE
-from baselines.mlp import MlpPolicy
-from baselines.policies import interface_of
-from baselines.recipes import ACTIVATIONS, Recipe
+from baselines.compiled_ppo.networks import Networks
+from baselines.compiled_ppo.training import STATE, NetworkTraining, as_floats, sizes_of
+from baselines.recipes import Recipe
 from quad_gym.batch.threads import (
     MIN_BLOCKS_PER_THREAD,
     POSTED_BEFORE,
@@ -25,104 +20,6 @@ from quad_gym.batch.threads import (
 )
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
-
-# --------------------------------------------------------------------------------------------------
-# Actor and critic of PPO: multilayer perceptrons in one vector of parameters.
-# --------------------------------------------------------------------------------------------------
-
-Floats = NDArray[np.float32]
-Table = NDArray[np.int64]
-
-
-class Networks:
-    """Gaussian policy and value function of a recipe, for observations and actions of some lengths.
-
-    `critic_only` inputs, at the end of an observation, are for the critic only. The vector of
-    parameters contains the logarithms of the policy's standard deviations directly after the
-    actor's layers. Initial values of layers are drawn as in Stable-Baselines3.
-    """
-
-    def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        recipe: Recipe,
-        rng: np.random.Generator,
-        critic_only: int = 0,
-    ) -> None:
-        self.actor, first = _table_of((inputs - critic_only, *recipe.layers, outputs), 0)
-        self.critic, count = _table_of((inputs, *recipe.critic_layers, 1), first + outputs)
-        self._activation, self.params = recipe.activation, np.zeros(count, np.float32)
-        self.net = (self.params, np.zeros_like(self.params), ACTIVATIONS.index(recipe.activation))
-        self.model = (self.net, self.actor, self.critic)
-        self.log_std = self.params[first : first + outputs]
-        self.log_std[:] = recipe.policy.get("log_std_init", 0.0)
-        for table, last_gain in ((self.actor, 0.01), (self.critic, 1.0)):
-            for W, _ in self.layers(table)[:-1]:
-                W[:] = np.sqrt(2.0) * orthogonal(W.shape, rng)
-            W, _ = self.layers(table)[-1]
-            W[:] = last_gain * orthogonal(W.shape, rng)
-        self._room = tuple(room[0] for room in self.rooms(1)[:2])
-
-    def layers(self, table: Table, vector: Floats | None = None) -> list[tuple[Any, Any]]:
-        """Weights (outputs, inputs) and biases (outputs,) of each layer, as views.
-
-        They are views of the parameters, or of a vector like these, such as a gradient.
-        """
-        vector = self.params if vector is None else vector
-        return [
-            (vector[w : w + i * o].reshape(o, i), vector[b : b + o])
-            for i, o, w, b, _ in table.tolist()
-        ]
-
-    def flip(self) -> None:
-        """Update the flipped weights from the parameters."""
-        for table in (self.actor, self.critic):
-            kernels.flip(self.net, table)
-
-    def rooms(self, parts: int) -> tuple[Floats, ...]:
-        """Work memory of `kernels.differentiate`: inputs, outputs, deltas, and a matrix product."""
-        tables = (self.actor, self.critic)
-        sizes = (
-            (2, TILE, int(self.critic[0, INPUTS])),
-            (TILE * max(int(t[-1, STORED] + t[-1, OUTPUTS]) for t in tables),),
-            (2, TILE * max(int(t[:, OUTPUTS].max()) for t in tables)),
-            (max(int((t[:, INPUTS] * t[:, OUTPUTS]).max()) for t in tables),),
-        )
-        return tuple(np.zeros((parts, *size), np.float32) for size in sizes)
-
-    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
-        """Means of actions (n, a) and values (n,) for observations x (n, o)."""
-        means = np.empty((len(x), len(self.log_std)), np.float32)
-        values = np.empty(len(x), np.float32)
-        kernels.evaluate(x, self.model, *self._room, means, values)
-        return means, values
-
-    def policy(self, record: Mapping[str, Any]) -> MlpPolicy:
-        """Copy the actor to a policy that requires only NumPy."""
-        layers = self.layers(self.actor)
-        activations = [self._activation] * (len(layers) - 1) + ["none"]
-        return MlpPolicy(
-            [W.copy() for W, _ in layers], [b.copy() for _, b in layers], activations, record
-        )
-
-
-def _table_of(sizes: Sequence[int], first: int) -> tuple[Table, int]:
-    """Table of a network whose parameters begin at `first`, and the end of its parameters."""
-    rows, stored = [], 0
-    for inputs, outputs in pairwise(sizes):
-        rows.append((inputs, outputs, first, first + inputs * outputs, stored))
-        first += (inputs + 1) * outputs
-        stored += outputs
-    return np.array(rows, np.int64), first
-
-
-def orthogonal(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[Any]:
-    """Draw a matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014)."""
-    Q, R = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
-    Q *= np.sign(np.diag(R))
-    return Q if shape[0] >= shape[1] else Q.T
-
 
 # --------------------------------------------------------------------------------------------------
 # Update step of PPO: epochs of minibatches, on as many threads as are worthwhile.
@@ -243,10 +140,8 @@ PARAMETERS = {
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""
 
-_EPISODES = 100  #: number of latest episodes whose mean return is `training_return`
 
-
-class CompiledPPO:
+class CompiledPPO(NetworkTraining):
     """PPO (Schulman et al. 2017) as in `stable_baselines3.PPO`, except for the random numbers.
 
     The same seed gives bitwise the same policy, with any number of threads. With `critic_only`
@@ -274,13 +169,10 @@ class CompiledPPO:
         threads: int | None = None,
     ) -> None:
         inputs, outputs = sizes_of(env)
-        self.parameters = _checked(recipe, inputs)
-        self.env, self.recipe, self.num_timesteps = env, recipe, 0
-        self.losses: dict[str, float] = {}
-        self._env_seed = seed if env_seed is None else env_seed
-        self._rng = np.random.default_rng(seed)
+        super().__init__(env, recipe, _checked(recipe, inputs), seed, env_seed)
         critic_only = self.parameters["critic_only"]
         self.networks = Networks(inputs, outputs, recipe, self._rng, critic_only)
+        self._observed = slice(inputs - critic_only)
         shape = (self.parameters["n_steps"], env.num_envs)
         self._observations = np.zeros((*shape, inputs), np.float32)
         self._actions = np.zeros((*shape, outputs), np.float32)
@@ -296,66 +188,18 @@ class CompiledPPO:
             self.parameters,
             resolve_threads(threads),
         )
-        self._seen: NDArray[np.float32] | None = None
-        self._returns, self._finished = np.zeros(env.num_envs), deque[float](maxlen=_EPISODES)
 
-    def learn(
-        self,
-        steps: int,
-        watch: Callable[["CompiledPPO"], bool] | None = None,
-        *,
-        quiet: bool = False,
-    ) -> None:
-        """Train until a total number of environment steps, summed over all flights, is reached.
+    def _round(self, steps: int) -> None:
+        self._roll_out()
+        rate = self._rate(1.0 - self.num_timesteps / steps)
+        self.losses = self.learner.learn(rate, self._rng)
 
-        The last rollout is completed. `watch` is called between rollouts; the training stops if it
-        returns False. `quiet` hides the progress bar.
-        """
-        from tqdm.auto import tqdm
+    def _progress(self) -> str:
+        return f"return {self.training_return:.1f}"
 
-        self.prepare()
-        first, last = self.recipe.learning_rate
-        begun = min(self.num_timesteps, steps)
-        look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": quiet}
-        with tqdm(total=steps, initial=begun, **look) as bar:
-            while self.num_timesteps < steps and (watch is None or watch(self)):
-                self._roll_out()
-                remaining = 1.0 - self.num_timesteps / steps
-                self.losses = self.learner.learn(last + (first - last) * remaining, self._rng)
-                bar.set_postfix_str(f"return {self.training_return:.1f}", refresh=False)
-                bar.update(min(self.num_timesteps, steps) - bar.n)
-
-    def prepare(self) -> None:
-        """Begin the first episodes, and compile all kernels."""
-        if self._seen is None:
-            self._seen = as_floats(self.env.reset(seed=self._env_seed)[0])
-        self.networks.evaluate(self._seen[:1])
+    def _compile(self, seen: NDArray[np.float32]) -> None:
+        self.networks.evaluate(seen[:1])
         self.learner.prepare()
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
-        """Return deterministic actions for observations (..., n), with or without critic's part."""
-        policy, x = self.networks.policy({}), np.asarray(observation, np.float32)
-        whole = x.shape[-1:] == self._observations.shape[-1:]
-        return policy.predict(x[..., : policy.inputs] if whole else x, state, episode_start)
-
-    def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
-        """Copy the present policy to one that requires only NumPy.
-
-        Its record defaults to the observations, actions and control rate of the training, so that
-        `load_policy` refuses environments with others.
-        """
-        return self.networks.policy(record_for(self.env) if record is None else record)
-
-    @property
-    def training_return(self) -> float:
-        """Mean return of the latest episodes, not scaled; NaN before the first."""
-        return float(np.mean(self._finished)) if self._finished else float("nan")
 
     def state(self) -> bytes:
         """Serialize the state of the training and the environment, to resume exactly.
@@ -363,7 +207,7 @@ class CompiledPPO:
         The flights of an environment of quad_gym are kept as a snapshot, which contains no names of
         classes and modules; another environment is pickled.
         """
-        kept = {name: getattr(self, name) for name in _STATE}
+        kept = {name: getattr(self, name) for name in STATE}
         arrays = (self.networks.params, self.learner.moments, self.learner.steps)
         if isinstance(self.env, QuadVectorEnv):
             return pickle.dumps((kept, arrays, {"flights": self.env.flights.batch.snapshot()}))
@@ -384,7 +228,7 @@ class CompiledPPO:
             self.env = flown["env"]
         self.networks.params[:], self.learner.moments[:] = params, moments
         self.learner.steps = steps
-        self.__dict__.update({name: kept[name] for name in _STATE})
+        self.__dict__.update({name: kept[name] for name in STATE})
 
     # ---- a rollout ------------------------------------------------------------------------------
 
@@ -401,10 +245,7 @@ class CompiledPPO:
             noise = self._rng.standard_normal(means.shape, np.float32)
             self._actions[t] = means + spread * noise
             self._log_probs[t] = -0.5 * (noise * noise).sum(axis=1) - peak
-            seen, reward, terminated, truncated, info = self.env.step(
-                self._actions[t].clip(-1.0, 1.0)
-            )
-            self._seen = as_floats(seen)
+            reward, terminated, truncated, info = self._step(self._actions[t].clip(-1.0, 1.0))
             self._rewards[t] = np.float32(self.recipe.reward_scale) * reward.astype(np.float32)
             self._ended[t] = terminated | truncated
             cut = np.flatnonzero(truncated & ~terminated)
@@ -412,19 +253,11 @@ class CompiledPPO:
                 last = as_floats(np.stack(info["final_obs"][cut]))
                 value = evaluate(last)[1]
                 self._rewards[t, cut] += self.parameters["gamma"] * value
-            self._returns += reward
-            self._finished += self._returns[self._ended[t]].tolist()
-            self._returns[self._ended[t]] = 0.0
-        self.num_timesteps += self._ended.size
         discounts = (self.parameters["gamma"], self.parameters["gae_lambda"])
         ahead = evaluate(self._seen)[1]
         rollout = (self._rewards, self._values, self._ended, ahead)
         self._advantages[:] = advantages(*rollout, *discounts)
         self._targets[:] = self._advantages + self._values
-
-
-_STATE = ("num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
-"""Attributes of the state of a training, in addition to networks and environment."""
 
 
 def advantages(
@@ -451,35 +284,6 @@ def advantages(
         ahead = rewards[t] + goes_on * (next_values + np.float32(gae_lambda) * ahead) - values[t]
         found[t], next_values = ahead, values[t]
     return found
-
-
-def record_for(env: VectorEnv[Any, Any, Any]) -> dict[str, Any]:
-    """Record of a policy with the observations, actions and control rate of its training."""
-    ours = isinstance(env.unwrapped, QuadVectorEnv)
-    return {"interface": interface_of(env) if ours else {}}
-
-
-def as_floats(observations: Any) -> NDArray[np.float32]:
-    """Convert observations or actions to contiguous float32."""
-    return np.ascontiguousarray(observations, np.float32)
-
-
-def sizes_of(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
-    """Check the spaces and the autoreset mode; return lengths of observation and action."""
-    sizes = []
-    for name, space in (
-        ("observations", env.single_observation_space),
-        ("actions", env.single_action_space),
-    ):
-        if not isinstance(space, Box) or len(space.shape) != 1:
-            raise ValueError(f"env must have vectors as {name} for compiled PPO, got {space}")
-        sizes.append(space.shape[0])
-    if space != Box(-1.0, 1.0, space.shape, space.dtype):  # type: ignore[arg-type]
-        raise ValueError(f"env must have actions in [-1, 1] (see RescaleAction), got {space}")
-    mode = env.metadata.get("autoreset_mode")
-    if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
-        raise ValueError(f"env must have the autoreset mode SameStep, got {mode}")
-    return sizes[0], sizes[1]
 
 
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import gymnasium
 
 from baselines.compiled_ppo.imitation import Imitation, columns_of
 from baselines.compiled_ppo.ppo import CompiledPPO
+from baselines.compiled_ppo.training import NetworkTraining
 from baselines.keeping import (
     STATE,
     RunKeeper,
@@ -54,10 +55,10 @@ class CompiledKeeper(RunKeeper):
     events: Events | None = None
     """Writer for TensorBoard; None: no files"""
 
-    def _training_return(self, model: CompiledPPO | Imitation) -> float:
+    def _training_return(self, model: NetworkTraining) -> float:
         return model.training_return
 
-    def _save(self, model: CompiledPPO | Imitation, *, best: bool) -> None:
+    def _save(self, model: NetworkTraining, *, best: bool) -> None:
         content = io.BytesIO()
         record = {"plan": description(self._plan), "interface": interface_of(self._judge)}
         if self.events is not None:
@@ -72,7 +73,7 @@ class CompiledKeeper(RunKeeper):
         replace_file(last_file(self._plan, self._folder), content.getvalue())
 
 
-def make_compiled(plan: Plan) -> CompiledPPO | Imitation:
+def make_compiled(plan: Plan) -> NetworkTraining:
     """Make the untrained model of a plan, with its environment."""
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
     flights = plan.make_vector_flights()
@@ -120,7 +121,7 @@ def run(
     if tensorboard:
         keeper.events = Events(folder / "tensorboard" / "run")
 
-    def watch(model: CompiledPPO | Imitation) -> bool:
+    def watch(model: NetworkTraining) -> bool:
         keeper.watch(model, model.num_timesteps)
         return not keeper.stopping
 

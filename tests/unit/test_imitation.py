@@ -78,6 +78,8 @@ def test_network_observes_its_columns_only_and_the_teacher_everything():
     np.testing.assert_array_equal(model.predict(x)[0], model.policy().predict(x[:, [2, 1]])[0])
     np.testing.assert_array_equal(model.predict(x[:, [2, 1]])[0], model.predict(x)[0])
     assert model.losses["squared_error"] > 1e-2  # the position, which it does not observe
+    with pytest.raises(ValueError, match=r"must be \(\.\.\., 2\), got shape \(5, 4\)"):
+        model.predict(drawn(0, 5, 4))
 
 
 def test_memory_of_the_teacher_lasts_until_the_end_of_its_episode():
