@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from baselines.mlp import MlpPolicy, mlp_of
 from baselines.normalization import Normalization, NormalizedPolicy
 from baselines.policies import is_included, load_policy, pretrained_file, record_of
 from quad_gym.envs import keywords_of
+from quad_gym.envs.keywords import env_option
 from quad_gym.envs.spaces import ObservationField, layout_bounds
 from quad_gym.packing import params_record
 from quad_gym.params import checks as check
@@ -172,11 +172,11 @@ def controller_of(
     if keywords is None:
         keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
         # keywords that are given replace all of the record, so a user must name all of them
-        words = " ".join(shlex.quote(f"{name}={value}") for name, value in keywords.items())
+        given = env_option(keywords).lstrip()
         for name, value in keywords.items():
-            _require_no_module(file, f"--env {words}", value)
+            _require_no_module(file, given, value)
             if name not in ("task", "estimator"):  # which name modules
-                _require_no_file(file, f"--env {words}", value)
+                _require_no_file(file, given, value)
     env = gymnasium.make_vec(env_id, num_envs=1, threads=1, **keywords)
     try:
         found: Any = load_policy(str(file), env, normalization)

@@ -9,7 +9,6 @@ import dataclasses
 import io
 import itertools
 import re
-import shlex
 import shutil
 import sys
 import textwrap
@@ -27,6 +26,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from quad_gym.envs import IDS
 from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS, TASK_KEYWORDS, EnvConfig
+from quad_gym.envs.keywords import env_option
 from quad_gym.params import checks as check
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
@@ -276,12 +276,6 @@ def flying_options(keywords: Mapping[str, Any]) -> str:
     rest = dict(keywords)
     words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors", "estimator") if k in rest]
     return "".join(" " + word for word in words) + env_option(rest)
-
-
-def env_option(keywords: Mapping[str, Any]) -> str:
-    """Format keywords of an environment as the option --env after a space; empty without any."""
-    words = " ".join(shlex.quote(f"{k}={v}") for k, v in keywords.items())
-    return words and f" --env {words}"
 
 
 _WORDS = {"true": "True", "false": "False", "none": "None"}

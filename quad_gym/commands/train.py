@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 from quad_gym import IDS
 from quad_gym.commands import options
+from quad_gym.envs.keywords import env_option
 
 
 @dataclass(frozen=True)
@@ -123,5 +124,5 @@ def main(args: TrainArgs) -> None:
     policy = f"--policy {done.best_policy}{options.flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
     if plan.recipe.algorithm != "recurrent_ppo":
-        env = options.env_option(plan.environment)
+        env = env_option(plan.environment)
         print(f"Export it: quad-gym export policy {done.best_policy} --to c{env}")

@@ -2,10 +2,11 @@
 
 `EnvKeywords` is the only list of them. Type checkers and editors read it from `**keywords` of the
 interfaces, `inspect.signature` and `help` from the signatures that `shows` makes of it. `QuadEnv`
-explains each keyword.
+explains each keyword. `env_option` writes given keywords for a command line.
 """
 
 import inspect
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar
@@ -112,3 +113,9 @@ def shows(keywords: type) -> Callable[[F], F]:
         )
 
     return decorate
+
+
+def env_option(keywords: Mapping[str, Any]) -> str:
+    """Format keywords as the option --env of the commands, after a space; empty without any."""
+    words = " ".join(shlex.quote(f"{k}={v}") for k, v in keywords.items())
+    return words and f" --env {words}"

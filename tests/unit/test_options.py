@@ -13,7 +13,6 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     SuiteNames,
-    env_option,
     environment_of,
     flying_options,
     known_id,
@@ -22,6 +21,7 @@ from quad_gym.commands.options import (
     usage_errors,
 )
 from quad_gym.envs import IDS
+from quad_gym.envs.keywords import env_option
 from tests.console_commands import plain
 
 
