@@ -304,8 +304,13 @@ class Linear:
     last: float
 
     def __call__(self, remaining: float) -> float:
-        """Return the value when a share `remaining` of the training remains."""
-        return self.last + (self.first - self.last) * remaining
+        """Return the value when a share `remaining` of the training remains.
+
+        A training ends with a whole rollout, where the share is below zero, and far below if the
+        rollout is longer than the training: the value stays above half of the smaller one.
+        """
+        value = self.last + (self.first - self.last) * remaining
+        return max(value, 0.5 * min(self.first, self.last))
 
 
 def description(plan: Plan) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from baselines.compiled_ppo import CompiledPPO
 from baselines.keeping import STATE, RunError
 from baselines.mlp import MlpPolicy
 from baselines.policies import PRETRAINED, load_policy
-from baselines.recipes import Plan, recipe
+from baselines.recipes import Linear, Plan, recipe
 from baselines.training import export, train
 from tests import console_commands
 from tests.builders import run_python
@@ -298,3 +298,13 @@ def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
     assert sorted(found.Tags()["scalars"]) == ["evaluation/mean_error", "train/loss"]
     errors = found.Scalars("evaluation/mean_error")
     assert [(e.step, e.value) for e in errors] == [(0, 0.5), (100, 100.5)]
+
+
+def test_learning_rate_stays_positive_in_a_rollout_longer_than_the_training():
+    first, last = 1e-3, 1e-4
+    rate = Linear(first, last)
+    np.testing.assert_allclose([rate(share) for share in (1.0, 0.5, 0.0)], [first, 5.5e-4, last])
+    # 2,000,000 steps in rollouts of 8,192 end after 2,007,040: the line goes on
+    assert rate(1.0 - 2_007_040 / 2_000_000) == pytest.approx(last - 3.168e-6)
+    assert rate(1.0 - 8_192 / 2_000) == 0.5 * last
+    assert Linear(last, first)(1.0) == pytest.approx(last)  # a schedule may rise
