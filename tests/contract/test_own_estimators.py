@@ -436,7 +436,7 @@ def test_commands_fly_on_an_estimator(named, tmp_path):
     assert flown.returncode == 0, flown.stderr
     assert np.isnan(quad_gym.Flight.load(tmp_path / "flight.npz")["nees"][1:]).all()
     film = console_commands.run(
-        "fly", "hover", "--duration", 0.2, "--output", tmp_path / "flight.gif", *own
+        "fly", "hover", "--duration", 0.2, "--output", tmp_path / "film.gif", *own
     )
     assert film.returncode == 0, film.stderr
     wrong = console_commands.run("fly", "hover", *own, "--env", "estimator=ekf")
