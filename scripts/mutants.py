@@ -80,7 +80,7 @@ _COSTLY = {
 }
 """Files of which a test takes minutes, or compiles for another processor: left out, too."""
 _PROCESSES = re.compile(
-    r"subprocess|AsyncVectorEnv|multiprocessing|quad_gym\.kernels\.compiling\.cache"
+    r"subprocess|run_python|AsyncVectorEnv|multiprocessing|kernels\.compiling(\.| import )cache"
 )
 """Text in files of tests of which processes, or the cache, would compile all kernels again."""
 _FAST = {

@@ -14,7 +14,7 @@ from quad_gym.logs.replaying.results import Severity
 from quad_gym.records import Source
 from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import fly, state_errors, steps
-from tests.level_flights import MAGNETIC, LevelFlight
+from tests.level_flights import GRAVITY, MAGNETIC, LevelFlight
 
 FLIGHTS = 48
 
@@ -76,6 +76,27 @@ def test_rest_shows_no_heading_and_no_other_one_replaces_the_compass():
             assert k < 10 or kf._engine.read("level_sigma")[0] > 0.35
     assert kf._engine.read("level_tick")[0] < 0.0
     assert kf._engine.read("compass_out")[0] == 0.0
+
+
+def test_wrong_compass_is_used_again_after_a_minute_in_which_it_agreed():
+    """The field is turned by 90 degrees from 3 to 70 s. The heading of the vehicle is constant."""
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(1), amplitude=1.0), 0.04
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    kf.initialize(flight.gnss(0.0)[0], magnetometer=flight.field())
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    times, out = np.arange(1, 3301) * dt, []
+    for k, t in enumerate(times):
+        kf.predict(*flight.sample(t - dt, dt), dt=dt)
+        if k % 5 == 4:
+            position, velocity = flight.gnss(t)
+            field = turn @ flight.field() if 3.0 < t < 69.9 else flight.field()
+            kf.update(position, gnss_velocity_G=velocity, magnetometer=field)
+        out.append(kf._engine.read("compass_out")[0] > 0.0)
+    first, last = times[out][[0, -1]]
+    assert first < 6.0
+    assert last == pytest.approx(70.0 + 60.0, abs=0.5)
+    assert np.count_nonzero(out) == round((last - first) / dt) + 1
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
@@ -144,6 +165,49 @@ def test_unknown_heading_keeps_its_standard_deviation_without_motion(kind):
     assert not kf.heading_known
 
 
+@pytest.mark.parametrize("tilt_sigma", [0.03, 0.1])
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_unknown_heading_is_turned_to_the_field_and_has_20_degrees(kind, tilt_sigma):
+    """The noise of the field is so large that the update itself contributes nothing.
+
+    A tilt beyond the usual 0.06 rad turns the level part of a steep field.
+    """
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    compass = MAGNETIC.magnetometer.replace(noise_sigma=1e-3, declination=0.5)
+    kf, R_BI = kind(MAGNETIC.replace(gnss=gnss, magnetometer=compass)), euler_to_dcm([0, 0, 0.8])
+    kf.initialize(np.zeros(3), tilt_sigma=tilt_sigma)
+    assert math.sqrt(kf.covariance[8, 8]) > 1.5
+    kf.predict(np.zeros(3), [0.0, 0.0, GRAVITY])
+    kf.update(magnetometer=R_BI @ compass.field_I)
+    np.testing.assert_allclose(kf.R_BI, R_BI, atol=1e-5)
+    leaning = math.tan(compass.inclination) ** 2 * max(tilt_sigma**2 - 0.06**2, 0.0)
+    assert kf.covariance[8, 8] == pytest.approx(0.35**2 + leaning, rel=3e-3)
+
+
+@pytest.mark.parametrize("off", [0.8, -2.0])
+def test_heading_that_is_suddenly_wrong_is_replaced_by_the_third_fix(off):
+    """The error is more than 4 standard deviations from then on, and only the motion shows it."""
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(3), amplitude=0.5), 0.02
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(magnetometer=None, gnss=gnss))
+    kf.initialize(flight.gnss(0.0)[0], heading=flight.yaw)
+
+    def fly_to(*times):
+        for t in times:
+            for k in range(5):
+                kf.predict(*flight.sample(t - (5 - k) * dt, dt), dt=dt)
+            position, velocity = flight.gnss(t)
+            kf.update(position, gnss_velocity_G=velocity)
+        return kf._engine.read("compass_out")[0]
+
+    assert fly_to(*np.linspace(0.1, 4.0, 40)) == 0.0
+    kf._engine.fill("R_hat", kf.R_BI @ euler_to_dcm([0.0, 0.0, off]))
+    for t in (4.1, 4.2, 4.3):
+        assert fly_to(t) == (t == 4.3)
+    assert abs(flight.error(kf, 4.3)[8]) < 0.1
+    np.testing.assert_allclose(kf.velocity[:2], kf._engine.read("level_state")[0, :2], atol=1e-3)
+
+
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
 def test_heading_is_less_certain_after_a_long_loss_of_gnss_and_none_is_reset(kind):
     flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(3), amplitude=0.5), 0.02
@@ -162,6 +226,31 @@ def test_heading_is_less_certain_after_a_long_loss_of_gnss_and_none_is_reset(kin
     assert (np.diff(sigmas[500:2000]) >= 0.0).all()
     assert sigmas[1999] > 1.2 * sigmas[499]
     assert kf._engine.read("compass_out")[0] == 0.0
+
+
+@pytest.mark.parametrize("off", [0.0, 1.6])
+def test_loss_of_gnss_adds_the_drift_of_the_gyro_to_the_heading_by_motion(off):
+    """A loss of T adds T^2 times the variances of the biases, and a random walk, for any heading.
+
+    N begins with the filter's heading, which is `off`.
+    """
+    flight, dt, loss = LevelFlight(MAGNETIC, np.random.default_rng(3), amplitude=0.5), 0.02, 5.0
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(magnetometer=None, gnss=gnss))
+    kf.initialize(flight.gnss(0.0)[0], heading=flight.yaw + off)
+    fixes = {200, 200 + round(loss / dt)}  # the last one before, and the first one after the loss
+    variances = []
+    for k in range(1, max(fixes) + 1):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if (k % 5 == 0 and k < 200) or k in fixes:
+            drift, (position, velocity) = np.trace(kf.covariance[12:, 12:]), flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity)
+        if k in fixes:
+            u = kf._engine.read("level_state")[0, 2:4]
+            variances.append(kf._engine.read("level_P")[0, 1] / (2.0 * u @ u))
+    added = loss**2 * drift + 0.01**2 * loss / (u @ u)
+    assert variances[1] - variances[0] == pytest.approx(added, rel=1e-6)
+    assert loss**2 * drift > 0.01 * added
 
 
 @pytest.mark.parametrize("step", [0.1, -0.3])

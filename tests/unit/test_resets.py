@@ -1,6 +1,7 @@
 """Protection of the filter: resets, adaptation of noise, and that neither does harm."""
 
 import gzip
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,18 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 import quad_gym.frames
 from quad_gym.estimation import replay
-from quad_gym.records import AID_GROUPS, POSITION_BLOCK, VELOCITY_BLOCK, Aid, GateDecision
+from quad_gym.records import (
+    AID_GROUPS,
+    BASELINE_BLOCK,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
+    Aid,
+    GateDecision,
+)
+from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import fly, state_errors, steps
 from tests.filter_states import set_at_rest
+from tests.level_flights import MAGNETIC
 
 R_BI = Rotation.from_rotvec([-0.2, 0.4, -0.1]).as_matrix()
 SUITE = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
@@ -32,17 +42,23 @@ def started(deviations, seed=0):
     return ukf
 
 
+def refused_for_long(ukf, block, *, stepped):
+    """Let a filter have refused the measurements of a block for too long."""
+    blocks = ukf._engine.blocks
+    blocks["tick"] += 2.0 * SUITE.estimator.glitch_timeout * SUITE.imu.rate
+    blocks["accepted_tick"][:] = 0.0
+    blocks["rejected_in_row"][:, block] = 20.0
+    blocks["stepped"][:, block] = stepped
+
+
 def refuse(ukf, off, *, stepped, corrected=0.0):
     """Update with a velocity that is `off` [m/s], after velocities were refused for too long.
 
     The biases have been `corrected` by this much [m/s^2], [rad/s] before.
     """
+    refused_for_long(ukf, VELOCITY_BLOCK, stepped=stepped)
     blocks = ukf._engine.blocks
-    blocks["tick"] += 2.0 * SUITE.estimator.glitch_timeout * SUITE.imu.rate
-    blocks["accepted_tick"][:] = 0.0
     blocks["corrected"][:], blocks["corrected_tick"][:] = corrected, blocks["tick"]
-    blocks["rejected_in_row"][:, VELOCITY_BLOCK] = 20.0
-    blocks["stepped"][:, VELOCITY_BLOCK] = stepped
     lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
     expected = ukf.velocity + ukf.R_BI.T @ lever
     ukf.update(gnss_velocity_G=R_IG.T @ (expected + off))
@@ -66,8 +82,11 @@ def assert_close(covariance, expected):
 DEVIATIONS = np.repeat([0.1, 0.05, 0.01, 0.002, 1e-4], 3)
 
 
-def test_reset_after_a_step_sets_variances_of_the_measured_states_alone():
+@pytest.mark.parametrize("compass_out", [0.0, 1.0])
+def test_reset_after_a_step_sets_variances_of_the_measured_states_alone(compass_out):
+    """A compass that is left out does not matter."""
     ukf, off = started(DEVIATIONS), np.array([5.0, -3.0, 2.0])
+    ukf._engine.blocks["compass_out"] = compass_out
     before = ukf.covariance
     refuse(ukf, off, stepped=True)
     rows = np.arange(3, 6)
@@ -76,6 +95,38 @@ def test_reset_after_a_step_sets_variances_of_the_measured_states_alone():
     assert_close(ukf.covariance, expected)
     assert ukf._engine.read("resets")[0, VELOCITY_BLOCK] == 1.0
     np.testing.assert_array_equal(ukf._engine.read("alarm_tick"), ukf._engine.read("tick"))
+
+
+def test_reset_to_a_baseline_cuts_the_covariances_of_the_heading_alone():
+    """The heading is the angle about the vertical. All other states keep their covariances."""
+    ukf = started(DEVIATIONS)
+    before = ukf.covariance
+    refused_for_long(ukf, BASELINE_BLOCK, stepped=True)
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    ukf.update(gnss_baseline_G=R_IG.T @ turn @ R_BI.T @ SUITE.gnss.baseline_B)
+    assert ukf._engine.read("resets")[0, BASELINE_BLOCK] == 1.0
+    k, S = R_BI[:, 2], np.eye(15)  # axes of the attitude's errors: two level ones, and k
+    S[6:9, 6:9] = np.column_stack([*np.linalg.svd(k[np.newaxis])[2][1:], k])
+    found, expected = S.T @ ukf.covariance @ S, cut(S.T @ before @ S, [8])
+    assert found[8, 8] > 0.05
+    expected[8, 8] = found[8, 8]
+    assert_close(found, expected)
+
+
+@pytest.mark.parametrize("against", [0.0, 1.0])
+def test_compass_refused_for_long_resets_the_heading_unless_the_motion_contradicts_it(against):
+    """The variance is the square of the innovation and of hard iron, over the level field's."""
+    compass, turn, group = MAGNETIC.magnetometer, 0.5, AID_GROUPS + Aid.MAGNETOMETER
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = quad_gym.UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    set_at_rest(kf, 1e-6 * np.eye(15))
+    refused_for_long(kf, group, stepped=False)
+    kf._engine.blocks["level_against"] = against
+    kf.update(magnetometer=euler_to_dcm([0.0, 0.0, turn]) @ compass.field_I)
+    assert kf._engine.read("resets")[0, group] == 1.0 - against
+    iron = compass.hard_iron_sigma / math.hypot(*compass.field_I[:2])
+    expected = 2.0 - 2.0 * math.cos(turn) + iron**2 if against == 0.0 else 1e-6
+    assert kf.covariance[8, 8] == pytest.approx(expected, rel=1e-3)
 
 
 def test_measurement_after_a_reset_determines_the_state():

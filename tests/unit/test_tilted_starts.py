@@ -120,6 +120,16 @@ def test_tilt_has_the_third_order_of_the_heading(axis):
     assert (T.T @ P @ T)[axis, axis] == pytest.approx(expected, rel=1e-12)
 
 
+def test_magnetic_heading_depends_on_both_angles_of_the_tilt():
+    """Error angles are e_x, e_y and a e_x + b e_y + e_z, with independent e_x, e_y and e_z."""
+    first, tilt, slopes = level_start(MAGNETIC), 0.02, (0.4, -1.5)
+    first["tilt_sigma"], first["heading_sigma"], first["heading_of_tilt"] = tilt, 0.05, slopes
+    P = still_start(first, np.zeros(3)).covariance[6:9, 6:9]
+    J = np.array([(1.0, 0.0), (0.0, 1.0), slopes])
+    expected = tilt**2 * J @ J.T + np.diag([0.0, 0.0, 0.05**2])
+    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-18)
+
+
 REST = {"accel": [0.0, 0.0, GRAVITY]}
 
 

@@ -11,7 +11,7 @@ from quad_gym.estimation.inputs import measured_blocks
 from quad_gym.logs.formats import read_log
 from quad_gym.logs.replaying.measurements import LogMeasurements, MisfitError
 from quad_gym.params.portable import euler_dcm
-from quad_gym.records import AID_BLOCK, Aid, Control, GateDecision
+from quad_gym.records import AID_BLOCK, AID_GROUPS, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import batch as flights_of
 from tests.field_flights import fly, nees, steps
@@ -289,3 +289,17 @@ WITH_GNSS = quad_gym.sensor_suite("rtk").simplified().replace(uwb_range=UWB.uwb_
 def test_filter_is_not_flagged_where_others_contradict_a_range(suite, detours):
     kind = UnscentedKalmanFilter
     assert seconds_until_flagged(suite, kind, lambda step: HERE + detours(step)) == np.inf
+
+
+def test_reset_to_ranges_is_as_large_as_the_largest_innovation_of_those_measured():
+    """An anchor without a range has the innovation of an earlier one."""
+    kf, group = ExtendedKalmanFilter(UWB), AID_GROUPS + Aid.UWB_RANGE
+    set_at_rest(kf, 1e-6 * np.eye(15))
+    blocks = kf._engine.blocks
+    blocks["tick"] += 60.0 * UWB.imu.rate
+    blocks["rejected_in_row"][:, group] = 20.0
+    blocks["innovation"][:, FIRST + 2, 0] = 50.0
+    off = np.array([2.0, -5.0, np.nan, 3.0])
+    kf.update(uwb_range=distances(kf.position, kf.R_BI, UWB.uwb_range) + off)
+    assert kf._engine.read("resets")[0, group] == 1.0
+    np.testing.assert_allclose(kf.covariance[:3, :3], 25.0 * np.eye(3), rtol=1e-3, atol=1e-3)

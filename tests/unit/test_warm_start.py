@@ -10,8 +10,9 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.starts import WARM_UP
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.packing import slow_states
 from quad_gym.params.suites import SUITES
-from quad_gym.records import FLIGHT_FIELDS, POSITION_BLOCK
+from quad_gym.records import FLIGHT_FIELDS, POSITION_BLOCK, Aid, joint_covariance
 from tests.field_flights import attitudes, fly, nees, state_errors, steps
 from tests.unit.alarms import ALARM, assert_normal
 
@@ -86,6 +87,24 @@ def test_covariance_of_a_start_turns_with_the_vehicle():
     assert abs(common[0, 0] / common[1, 1] - 1.0) > 0.02
     scale = np.sqrt(np.outer(np.diag(common), np.diag(common)))
     np.testing.assert_allclose((seen_from_the_vehicle - common) / scale, 0.0, atol=1e-9)
+
+
+def test_joint_errors_of_turned_starts_without_drift_have_their_covariance():
+    """Hard iron is the first slow error then, and its errors turn with the vehicle."""
+    suite = unmeasured("consumer")
+    suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
+    places, anywhere = slow_states(suite), {"start_yaw": Uniform(-np.pi, np.pi)}
+    iron, count = places.vectors[Aid.MAGNETOMETER], places.estimated
+    assert iron == 0
+    batch = fly(suite, 2000, task="hover", filter_start="warm", randomization=anywhere)
+    slow = -batch.record("slow_hat")[:, :count]
+    slow[:, iron : iron + 3] += batch.record("aid_vector")[:, Aid.MAGNETOMETER]
+    for aid in (Aid.BAROMETER, Aid.MAGNETOMETER):
+        slow[:, places.scalars[aid]] += batch.record("aid_scalar")[:, aid]
+    P = joint_covariance(batch.record("P"), batch.record("P_slow")[:, :count])
+    errors = np.hstack([state_errors(batch), slow])[..., np.newaxis]
+    white = np.linalg.solve(np.linalg.cholesky(P), errors)[..., 0]
+    assert_normal(white, np.zeros(15 + count), np.eye(15 + count))
 
 
 @pytest.mark.parametrize("name", SUITES)
