@@ -392,7 +392,7 @@ def run(
         lines[mutant.line - 1] = mutant.after + "\n"
         file.write_text("".join(lines), encoding="utf-8")
         environment[_WORDS_OF] = json.dumps(mutant.weights)
-        if folder_of(mutant) == "kernels":
+        if mutant.file.startswith("quad_gym/kernels/"):
             environment.update(_FAST)
     running = subprocess.Popen(
         [sys.executable, "-m", "pytest", *arguments_of(mutant, tests)],
