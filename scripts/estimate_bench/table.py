@@ -9,15 +9,16 @@ from scripts.estimate_bench.entries import FILE, Entry
 from scripts.estimate_bench.rows import MEMORY, SEEDS, arms_of
 from scripts.estimate_bench.tasks import TASKS, BenchTask
 from scripts.studies.campaign import DATA, flights_digest
-from scripts.studies.conclusions import LINE, verdict
+from scripts.studies.conclusions import LINE, NOT_MEASURED, verdict
 from scripts.studies.report import number, share
-from scripts.studies.rows import Rows, effect
+from scripts.studies.rows import Effect, Rows, effect
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
 HEADS = ("row", "track", "seeds", "success", "crashed", "return", "score", "processor seconds")
 
+ON_ESTIMATE = "training on the estimate, not the truth"
 COMPARED: Mapping[str, tuple[str, str]] = {
-    "training on the estimate, not the truth": ("estimate", "truth"),
+    ON_ESTIMATE: ("estimate", "truth"),
     "observing standard deviations, trained on the estimate": ("estimate_std", "estimate"),
     "observing standard deviations, trained on the truth": ("truth_std", "truth"),
     "privileged critic": ("privileged", "estimate_std"),
@@ -111,24 +112,43 @@ def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
     return "\n\n".join(parts)
 
 
+def effect_of(change: str, task: BenchTask, measured: Rows) -> Effect | None:
+    """Effect of one of `COMPARED` on the return; None unless both rows have all seeds."""
+    own = measured.where(task=task.name, flights=flights_digest(task.flights))
+    first, second = (own.of(arm) for arm in COMPARED[change])
+    return effect(first, second, "return") if min(first.seeds, second.seeds) >= SEEDS else None
+
+
 def effects(measured: Rows) -> str:
     """Differences of returns between pairs of rows, by task, as Markdown.
 
     A task without all seeds of both rows has an empty cell.
     """
     body = []
-    for change, pair in COMPARED.items():
-        cells = []
-        for task in TASKS:
-            own = measured.where(task=task.name, flights=flights_digest(task.flights))
-            first, second = (own.of(arm) for arm in pair)
-            complete = min(first.seeds, second.seeds) >= SEEDS
-            found = effect(first, second, "return") if complete else None
-            cells.append(
-                "" if found is None else f"{number(found.size, 0)}{LINE}({verdict(found)})"
-            )
+    for change in COMPARED:
+        found = [effect_of(change, task, measured) for task in TASKS]
+        cells = ["" if e is None else f"{number(e.size, 0)}{LINE}({verdict(e)})" for e in found]
         body.append([change, *cells])
     return f"\n{markdown_table(('change', *(task.name for task in TASKS)), body)}\n"
+
+
+def summary(measured: Rows) -> str:
+    """Sentence about the tasks in which a training on the estimate is better or worse."""
+    found = {task.name: effect_of(ON_ESTIMATE, task, measured) for task in TASKS}
+    known = {name: e for name, e in found.items() if e is not None}
+    if not known:
+        return NOT_MEASURED
+    better = [name for name, e in known.items() if e.significant and e.size.value > 0.0]
+    worse = [name for name, e in known.items() if e.significant and e.size.value < 0.0]
+    equal = [name for name, e in known.items() if not e.significant]
+    says = (("more", better), ("less", worse))
+    parts = [f"significantly {words} in {' and '.join(names)}" for words, names in says if names]
+    if equal:
+        parts.append(f"not significantly more or less in {' and '.join(equal)}")
+    return (
+        "Tested on the estimate, PPO that was trained on the estimate, compared with PPO that was "
+        f"trained on the truth, returns {', '.join(parts)} ({SEEDS} seeds of each)."
+    )
 
 
 def table(measured: Rows, entries: Path = ENTRIES) -> str:
@@ -141,4 +161,8 @@ def table(measured: Rows, entries: Path = ENTRIES) -> str:
 def texts(file: Path = DATA / "estimate_bench.csv") -> dict[str, str]:
     """Texts of the page, by the names of their marks."""
     measured = Rows.read(file)
-    return {"benchmark.table": table(measured), "benchmark.effects": effects(measured)}
+    return {
+        "benchmark.summary": summary(measured),
+        "benchmark.effects": effects(measured),
+        "benchmark.table": table(measured),
+    }

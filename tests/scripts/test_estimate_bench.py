@@ -161,6 +161,7 @@ def test_effects_of_training_are_differences_of_complete_rows():
     trained = cells["training on the estimate, not the truth"]
     assert [cell.strip() for k, cell in enumerate(trained) if k != of_circle] == [""] * 4
     assert re.fullmatch(r" 2 \[[12], [23]\]<br>\(p < 0.001\) ", trained[of_circle])
+    assert "returns significantly more in Circle (10 seeds of each)" in table.summary(Rows(rows))
     # the row with a standard deviation lacks a seed
     incomplete = cells["observing standard deviations, trained on the estimate"]
     assert incomplete[of_circle].strip() == ""
