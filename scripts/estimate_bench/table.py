@@ -14,7 +14,7 @@ from scripts.studies.report import number, share
 from scripts.studies.rows import Effect, Rows, effect
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
-HEADS = ("row", "track", "seeds", "success", "crashed", "return", "score", "processor seconds")
+HEADS = ("row", "seeds", "success", "crashed", "return", "score", "CPU s")
 
 ON_ESTIMATE = "training on the estimate, not the truth"
 COMPARED: Mapping[str, tuple[str, str]] = {
@@ -75,21 +75,25 @@ def lines(task: BenchTask, measured: Rows, entered: Rows) -> tuple[list[list[str
         else None
     )
     every = [
-        (arm.label, "memory" if arm.name in MEMORY else "memoryless", own.of(arm.name))
-        for arm in arms_of(task)
+        (_label(arm.label, memory=arm.name in MEMORY), own.of(arm.name)) for arm in arms_of(task)
     ]
     for row in {row["arm"]: row for row in entered.rows}.values():
-        every.append((str(row["label"]), str(row["track"]), fresh.of(row["arm"])))
-    found = [_line(label, track, rows, ends) for label, track, rows in every if rows.rows]
-    return found, [label for label, _, rows in every if not rows.rows]
+        label = _label(str(row["label"]), memory=row["track"] == "memory")
+        every.append((label, fresh.of(row["arm"])))
+    found = [_line(label, rows, ends) for label, rows in every if rows.rows]
+    return found, [label for label, rows in every if not rows.rows]
 
 
-def _line(label: str, track: str, rows: Rows, ends: tuple[float, float] | None) -> list[str]:
+def _label(label: str, *, memory: bool) -> str:
+    """Label of a row, with its track unless this is "memoryless"."""
+    return f"{label} (memory)" if memory else label
+
+
+def _line(label: str, rows: Rows, ends: tuple[float, float] | None) -> list[str]:
     returned = rows.estimated("return")
     scored = "" if ends is None or ends[1] <= ends[0] else number(score(returned, *ends), 2)
     return [
         label,
-        track,
         str(rows.seeds) if rows.trained else "rule",
         share(rows.estimated("success")),
         share(rows.estimated("crashed")),
@@ -105,8 +109,8 @@ def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
     body, missing = lines(task, measured, entered)
     parts = [f"### {task.name}", question]
     if body:
-        body += [[label, "", "none", *[""] * (len(HEADS) - 3)] for label in missing]
-        parts.append(markdown_table(HEADS, body, texts=2))
+        body += [[label, "none", *[""] * (len(HEADS) - 2)] for label in missing]
+        parts.append(markdown_table(HEADS, body))
     else:
         parts.append("No row is measured with the present flights yet.")
     return "\n\n".join(parts)
@@ -127,9 +131,15 @@ def effects(measured: Rows) -> str:
     body = []
     for change in COMPARED:
         found = [effect_of(change, task, measured) for task in TASKS]
-        cells = ["" if e is None else f"{number(e.size, 0)}{LINE}({verdict(e)})" for e in found]
-        body.append([change, *cells])
+        body.append([change, *("" if e is None else _cell(e) for e in found)])
     return f"\n{markdown_table(('change', *(task.name for task in TASKS)), body)}\n"
+
+
+def _cell(found: Effect) -> str:
+    """Effect and p, in bold if it is significant."""
+    p = verdict(found).removesuffix(", not significant")
+    size = number(found.size, 0)
+    return f"**{size}**{LINE}{p}" if found.significant else f"{size}{LINE}{p}"
 
 
 def summary(measured: Rows) -> str:

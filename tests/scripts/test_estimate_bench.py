@@ -160,7 +160,7 @@ def test_effects_of_training_are_differences_of_complete_rows():
     of_circle = [task.name for task in TASKS].index("Circle")
     trained = cells["training on the estimate, not the truth"]
     assert [cell.strip() for k, cell in enumerate(trained) if k != of_circle] == [""] * 4
-    assert re.fullmatch(r" 2 \[[12], [23]\]<br>\(p < 0.001\) ", trained[of_circle])
+    assert re.fullmatch(r" \*\*2 \[[12], [23]\]\*\*<br>p < 0.001 ", trained[of_circle])
     assert "returns significantly more in Circle (10 seeds of each)" in table.summary(Rows(rows))
     # the row with a standard deviation lacks a seed
     incomplete = cells["observing standard deviations, trained on the estimate"]
@@ -176,8 +176,8 @@ def test_table_shows_rows_of_the_present_flights_only():
     found, missing = table.lines(task, Rows(rows), Rows(()))
     lines = {line[0]: line for line in found}
     assert lines.keys().isdisjoint(missing)
-    assert lines["PPO, estimate"][2] == "3"
-    assert lines["PPO, estimate"][6].startswith("0.50 [")
+    assert lines["PPO, estimate"][1] == "3"
+    assert lines["PPO, estimate"][5].startswith("0.50 [")
     assert {"PPO, truth + independent noise", "SAC, estimate + standard deviations"} < set(missing)
     assert table.score(Estimated(15.0, 12.0, 18.0), 10.0, 20.0) == (0.5, 0.2, 0.8)
     with pytest.raises(ValueError, match="must exceed the rule's"):
