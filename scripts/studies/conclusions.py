@@ -376,7 +376,7 @@ def when_to_train(rows: Rows) -> str:
             _shown(case.rule.estimated(case.column), case.column),
             _shown(case.ideal.estimated(case.column), case.column),
             _shown(case.cost.size, case.column),
-            f"{_shown(case.gain.size, case.column)}{LINE}({verdict(case.gain)})",
+            LINE.join([_shown(case.gain.size, case.column), *verdict(case.gain).split(", ")]),
             f"{case.seeds}",
         ]
         for case in cases(rows)
