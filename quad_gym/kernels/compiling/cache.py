@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -49,8 +49,19 @@ _NO_CODE = {
 }
 """Modules that determine when code is compiled, but do not change the code."""
 _BEGAN = time.time()  #: when this process began to import kernels [s]
-_IMPORTED: dict[str, tuple[int, float]] = {}
-"""Modules with kernels: the identity of their names, and when the first kernel was made [s]."""
+
+
+class _Imported(NamedTuple):
+    """A module with kernels as it was when its first kernel was made."""
+
+    names: int  #: identity of its names, another one after a reload
+    when: float  #: time [s]
+    file: Path | None
+    status: tuple[int, ...]  #: status of the file; nothing if there is none
+
+
+_IMPORTED: dict[str, _Imported] = {}
+"""Modules with kernels, by name."""
 _FILES: dict[str, Path] = {}
 """Files of the modules of which there are digests."""
 _TABLE = f"{PACKAGE}.params.sensor_table"
@@ -95,13 +106,21 @@ def edited_source() -> Path | None:
 
     Digests are of files, and compiled code is of what was imported, so that the latter must not be
     kept under the former. An edit changes a file's time, or, if it replaces the file or the time is
-    set, the time of its change of status.
+    set, the time of its change of status. The clock of files lags behind `time.time` by up to one
+    tick of the kernel, 4 to 10 ms, so that an edit soon after the import shows in the status alone.
     """
     for name, file in _FILES.items():
         with contextlib.suppress(OSError):
             status = file.stat()
-            _, imported = _IMPORTED.get(name, (0, _BEGAN))
-            if max(status.st_mtime, status.st_ctime) > imported:
+            imported = _IMPORTED.get(name)
+            began = _BEGAN if imported is None else imported.when
+            if max(status.st_mtime, status.st_ctime) > began:
+                return file
+            if (
+                imported is not None
+                and imported.file == file
+                and imported.status != _changing(status)
+            ):
                 return file
     return None
 
@@ -110,8 +129,17 @@ def note_import(function: Callable[..., Any]) -> None:
     """Note when the module of a kernel was imported, at the latest; for `edited_source`."""
     names = function.__globals__
     known = _IMPORTED.get(function.__module__)
-    if known is None or known[0] != id(names):
-        _IMPORTED[function.__module__] = id(names), time.time()
+    if known is None or known.names != id(names):
+        file, status = None, tuple[int, ...]()
+        with contextlib.suppress(OSError, KeyError):
+            file = Path(names["__file__"])
+            status = _changing(file.stat())
+        _IMPORTED[function.__module__] = _Imported(id(names), time.time(), file, status)
+
+
+def _changing(status: os.stat_result) -> tuple[int, ...]:
+    """What an edit of a file changes of its status."""
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _parsed(content: bytes, package: str) -> tuple[str, list[str]]:
