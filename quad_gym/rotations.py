@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
+NORM_ERROR = 1e-2
+"""Largest error of an element of R R^T, or of the squared norm of a quaternion, in input that is
+taken as a rotation."""
+
+
 def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
@@ -26,6 +31,24 @@ def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.flo
         wrong = array[~np.isfinite(array)].flat[0]
         raise ValueError(f"{name} must be finite, got {wrong} among its values")
     return array
+
+
+def are_rotations(R: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of some (..., 3, 3) matrices are orthonormal with determinant 1, or nearly."""
+    error = np.abs(R @ R.swapaxes(-2, -1) - np.eye(3)).max(axis=(-2, -1))
+    good: NDArray[np.bool_] = (error < NORM_ERROR) & (np.linalg.det(R) > 0.0)
+    return good
+
+
+def _rotation_matrices(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    R = _rows(name, value, (3, 3))
+    good = are_rotations(R)
+    if not good.all():
+        raise ValueError(
+            f"{name} must be a rotation, with R R^T = I within {NORM_ERROR:g} and determinant 1, "
+            f"got {R[~good][0].tolist()}"
+        )
+    return R
 
 
 def _rotations() -> "type[Rotation]":
@@ -68,9 +91,9 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
         only a combination of pitch and yaw is determined, the pitch is 0.
 
     Raises:
-        ValueError: If `R_BI` has another shape or is not finite.
+        ValueError: If `R_BI` has another shape, is not finite, or is not a rotation.
     """
-    R = _rows("R_BI", R_BI, (3, 3))
+    R = _rotation_matrices("R_BI", R_BI)
     # atan2 keeps its accuracy where asin loses it, near +-pi/2
     cos_roll = np.hypot(R[..., 1, 0], R[..., 1, 1])
     roll = np.arctan2(R[..., 1, 2], cos_roll)
@@ -92,9 +115,9 @@ def dcm_to_vector(R_BI: ArrayLike) -> NDArray[np.float64]:
         (..., 3) theta, of at most half a turn, with R_BI = exp(-[theta x]) [rad].
 
     Raises:
-        ValueError: If `R_BI` has another shape or is not finite.
+        ValueError: If `R_BI` has another shape, is not finite, or is not a rotation.
     """
-    R = _rows("R_BI", R_BI, (3, 3))
+    R = _rotation_matrices("R_BI", R_BI)
     turns = _rotations().from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
     return turns.as_rotvec().reshape(R.shape[:-1])  # type: ignore[no-any-return]
 
@@ -129,9 +152,9 @@ def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
         (..., 4) quaternions (w, x, y, z).
 
     Raises:
-        ValueError: If `R_BI` has another shape or is not finite.
+        ValueError: If `R_BI` has another shape, is not finite, or is not a rotation.
     """
-    R = _rows("R_BI", R_BI, (3, 3))
+    R = _rotation_matrices("R_BI", R_BI)
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, (-2, -1), (0, 1))
     rows = (  # each is the quaternion times four times one of its components
         (1.0 + a + e + i, f - h, g - c, b - d),

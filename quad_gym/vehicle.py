@@ -49,7 +49,8 @@ def state_derivative(
 
     Args:
         state: position (3,) [m] and velocity (3,) [m/s] in I, R_BI (3, 3), body_rates (3,) [rad/s]
-            in B, rotor_speeds (4,) [rad/s].
+            in B, rotor_speeds (4,) [rad/s]. R_BI is used as it is, as the stages of an integrator
+            such as `scipy.integrate.solve_ivp` are no exact rotations.
         voltages: (4,) motor voltages [V], between 0 and the vehicle's largest.
         disturbance_I: (3,) external force in I [N].
         params: Parameters of the vehicle.

@@ -30,7 +30,7 @@ from quad_gym.records import (
 )
 from quad_gym.records.inputs import SensorReading
 from quad_gym.records.state import State
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.rotations import NORM_ERROR, are_rotations, quaternion_to_dcm
 
 # --------------------------------------------------------------------------------------------------
 # `Estimator`: a user's own filter in place of the built-in one, and checks of its estimates.
@@ -51,7 +51,6 @@ ESTIMATES: dict[str, tuple[int, ...]] = {
 }
 """Names in an estimate, and the shape of each for one flight."""
 
-_NORM_ERROR = 1e-2  #: largest error of the squared norm of a quaternion, or of R_BI R_BI^T
 _ASYMMETRY = 1e-4
 """Largest difference of covariances P_ij and P_ji over the standard deviations of both; sums in
 float32 reach 1e-5."""
@@ -139,14 +138,13 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
     if "R_BI" in found:
         R = found["R_BI"]
         with np.errstate(all="ignore"):  # of flights that are not in `rows`
-            skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-            good = (skew < _NORM_ERROR) & (np.linalg.det(R) > 0.0)
+            good = are_rotations(R)
         if not good.all():
             _require(method, 'rotations for "R_BI"', good, R, rows)
         return found
     quaternion = found.pop("quaternion")
     squares = np.einsum("ni,ni->n", quaternion, quaternion)
-    good = np.asarray(np.abs(squares - 1.0) < _NORM_ERROR)
+    good = np.asarray(np.abs(squares - 1.0) < NORM_ERROR)
     if not good.all():
         _require(method, 'rotations for "quaternion"', good, quaternion, rows)
     found["R_BI"] = quaternion_to_dcm(quaternion / np.sqrt(squares)[:, None])

@@ -415,7 +415,7 @@ class BenchmarkArgs:
     quick: bool = False
     """two short repeats of each measurement, to check that it runs"""
     output: Path = Path("results/benchmark")
-    """folder for benchmark.json"""
+    """folder for benchmark.json; an earlier one there is replaced"""
 
     def __post_init__(self) -> None:
         """Check the numbers."""

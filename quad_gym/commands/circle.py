@@ -259,7 +259,7 @@ class CircleArgs:
     duration: float = 10.0
     """length of a flight [s]"""
     output: Path = Path("results/circle")
-    """folder for figures and numbers, created if it is missing"""
+    """folder for figures and numbers, created if it is missing; earlier ones there are replaced"""
     threads: Threads = None
 
     radius: float = 4.0

@@ -249,7 +249,7 @@ class ConsistencyArgs:
     settle: float = 0.0
     """initial transient excluded from averages [s]"""
     output: Path = Path("results/consistency")
-    """folder for figures and numbers"""
+    """folder for figures and numbers; earlier ones there are replaced"""
     threads: options.Threads = None
 
     sensors: options.SuiteName = options.SENSORS

@@ -288,3 +288,14 @@ def test_bad_input_is_refused_by_name(function, name, good_shape):
             function(bad)
     with pytest.raises(ValueError, match=r"^q must not be zero"):
         rotations.quaternion_to_dcm([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "convert", [rotations.dcm_to_euler, rotations.dcm_to_vector, rotations.dcm_to_quaternion]
+)
+def test_matrices_that_are_no_rotations_are_refused(convert):
+    turn = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
+    convert(np.round(turn, 3))  # written with three digits
+    for bad in (np.zeros((3, 3)), 1.01 * turn, -turn, turn[[1, 0, 2]], [turn, np.ones((3, 3))]):
+        with pytest.raises(ValueError, match=r"^R_BI must be a rotation.* got \[\["):
+            convert(bad)
