@@ -174,7 +174,8 @@ def test_contradicted_heading_is_reset_by_the_motion_if_this_is_sharp_else_unkno
 def test_reset_by_the_motion_gives_tilt_velocity_and_biases_the_variances_of_a_start(first):
     """The vehicle leans, with all states correlated, and a first tilt beyond the usual.
 
-    N has its tilt. The velocity comes from the motion, at this tick, without the antenna's about the center.
+    N has its tilt. The velocity comes from the motion, at this tick, without the antenna's about
+    the center.
     """
     rules = compared(math.pi, 0.1, level_against=2.0, level_P=np.zeros(9))
     lean, u = euler_to_dcm([0.1, -0.2, 0.0]), 0.9 * np.exp(2.0j)
