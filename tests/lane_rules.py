@@ -23,6 +23,7 @@ class LaneRules(LaneFilter):
 
     def __init__(self, sensors, sigma=(0.1, 0.1, 0.05, 0.02, 0.002)):
         super().__init__(sensors)
+        self.settings["form"] = self.form
         stages = needed_stages(self.settings[0])
         stages = {stage: stages[stage] for stage in FILTER_STAGES if stage in stages}
         self._table = linked_table(stages, FILTER_ENTRIES)
