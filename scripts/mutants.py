@@ -6,8 +6,8 @@ A seed chooses the lines, in kernels, packing, parameters, estimation and tasks,
 broken: an operator, a comparison, a number, a branch. A copy of the checkout has one broken line,
 and runs the test files that are nearest to it: those that import its module, or share rare words
 with its line, its function and their docstrings. Of the tests in these files, the nearest ones run,
-in this order, and the first failure ends the run. Golden flights, which notice any change of a
-flight, are left out, as are a few files of which a test takes minutes.
+and the first failure ends the run. Golden flights, which notice any change of a flight, are left
+out, as are a few files of which a test takes minutes.
 
 A line of a kernel is broken in a process whose other kernels are compiled already
 (`mutants_of_kernels.py`), without tests that start processes of their own. If the nearest tests
@@ -92,7 +92,7 @@ _FAST = {
 """Settings with which kernels compile fast; the bits of flights do not depend on them."""
 _WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
 _FIRST, _MOST = 10, 60
-"""Number of tests that run first, and of all that run: the others in the order of their files."""
+"""Number of tests that run first, and of all that run."""
 _WORDS_OF = "QUAD_GYM_MUTANT"  #: variable with the words of the mutant, for pytest's process
 _OPERATORS: dict[type[ast.AST], str] = {
     ast.Add: "-",
@@ -346,7 +346,11 @@ def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str
 
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:
-    """Run the tests first that are nearest to the mutant; a hook, as pytest loads this module."""
+    """Run the tests first that are nearest to the mutant; a hook, as pytest loads this module.
+
+    Others follow in the order of their files, of each file as many as of others: its nearest tests,
+    each with its first parameters before any with further ones.
+    """
     words = [words_of(inspect.getsource(item.function)) for item in items]
     tests = Counter(word for found in words for word in set(found))
     weights = {
@@ -354,8 +358,17 @@ def pytest_collection_modifyitems(items: list[Any]) -> None:
         for word, weight in json.loads(os.environ[_WORDS_OF])
         if tests[word]
     }
-    order = sorted(range(len(items)), key=lambda i: -nearness(weights, words[i]))
-    items[:] = [items[i] for i in [*order[:_FIRST], *sorted(order[_FIRST:_MOST])]]
+    known, places = Counter[Any](), list[tuple[int, float]]()
+    for item, found in zip(items, words, strict=True):
+        places.append((known[item.function], -nearness(weights, found)))
+        known[item.function] += 1
+    order = sorted(range(len(items)), key=lambda k: (places[k][1], places[k][0]))
+    nearest, turns, rest = order[:_FIRST], Counter[Any](), list[tuple[int, int]]()
+    for k in sorted(set(order[_FIRST:]), key=places.__getitem__):
+        rest.append((turns[items[k].path], k))
+        turns[items[k].path] += 1
+    others = [k for _, k in sorted(rest)[: _MOST - _FIRST]]
+    items[:] = [items[k] for k in [*nearest, *sorted(others)]]
 
 
 def arguments_of(mutant: Mutant | None, tests: Sequence[str]) -> list[str]:

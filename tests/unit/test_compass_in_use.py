@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from quad_gym.kernels.filter import motion as motion_kernels
 from quad_gym.kernels.stages import Stage
 from quad_gym.records import (
     AID_BLOCK,
@@ -21,7 +20,7 @@ from quad_gym.records import (
 )
 from quad_gym.rotations import euler_to_dcm
 from tests.lane_filter import EIGHT
-from tests.lane_rules import NEVER, LaneRules
+from tests.lane_rules import LaneRules
 from tests.level_flights import MAGNETIC, R_IG
 
 SUITE = MAGNETIC.replace(gnss=MAGNETIC.gnss.replace(secondary_antenna_B=None))
@@ -149,7 +148,7 @@ def rows_of_attitude(rules):
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("first", [0.0, 0.02])
 def test_unknown_heading_is_tied_to_no_position_or_velocity(kind, first):
-    """Without a sensor of the heading it has no information, and the tilt that of N.
+    """Without a sensor of the heading it has no information, and N has the tilt.
 
     Derivatives lack the second order of a force with any heading, so the velocity has its square.
     """
@@ -257,8 +256,3 @@ def test_baseline_shows_an_unknown_heading_where_it_is_measured():
     k, P = R_BI[:, 2], rules.covariance()[:, 6:9, 6:9]
     sigma = np.sqrt(np.einsum("i,nij,j->n", k, P, k))
     np.testing.assert_allclose(sigma, np.where(shown, 0.35, UNKNOWN), rtol=1e-9)
-
-
-def test_lengths_of_the_probation_of_a_compass_are_those_of_the_documentation():
-    assert (motion_kernels._PROBATION, motion_kernels._LONG_PROBATION) == (10.0, 60.0)
-    assert NEVER < 0.0

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.kernels.filter import motion as motion_kernels
 from quad_gym.kernels.stages import Stage
 from quad_gym.records import AID_GROUPS, VELOCITY_BLOCK, Aid
 from quad_gym.rotations import euler_to_dcm
@@ -184,7 +183,7 @@ def test_nothing_is_measured_without_a_velocity_or_a_level_frame(fields):
 
 @pytest.mark.parametrize("T", [1.99, 2.01])
 def test_velocity_begins_after_two_seconds_without_a_fix_and_the_heading_stays(T):
-    """Its variance has the drift of the gyro, and is at most one. Leveling has decayed."""
+    """The variance has the drift of the gyro, and is at most one. Leveling has decayed."""
     rng = np.random.default_rng(4)
     rules, plain = begun(rng, level_loose=0.2)
     drift = (0.03, 0.05, 0.02)
@@ -263,7 +262,7 @@ ROW = {"rejected": 2.0, "out": 0.0, "leapt": 0.0, "since": 0.99}
 def test_gyro_whose_bias_may_have_changed_makes_the_heading_by_motion_uncertain(changes, loose):
     """After two rejected fields in a row, if the heading was confirmed in the last second.
 
-    The variance is that of a gyro that drifts since the last fix; a smaller one does not count.
+    A gyro that drifts since the last fix gives the variance; a smaller one does not count.
     """
     case = ROW | changes
     rng = np.random.default_rng(6)
@@ -323,4 +322,3 @@ def test_level_frame_turns_with_the_gyro_and_adds_up_the_force(confirmed):
     turned = W.T @ np.cross(gyro - kf.gyro_bias, arm)
     np.testing.assert_allclose(read("level_sum")[0, :2], sums + turned[:2], rtol=1e-4)
     assert read("level_phase")[0] == 1.0
-    assert motion_kernels._GYRO_OFFSET == 0.12

@@ -202,7 +202,7 @@ def test_refused_compass_is_left_out_if_the_motion_confirms_the_heading(known):
     [{"level_doubts": 1.0}, {"level_against": 1.0}, {"compass_out": 1.0}, {}],
     ids=["doubts", "against", "out", "none"],
 )
-def test_doubts_about_the_heading_keep_the_one_by_motion(changes):
+def test_contradicted_heading_keeps_the_variance_by_motion(changes):
     rules = refused(LaneRules(DRIFTING), "magnetometer", stepped=0.0, nu=(1e-5, 0.0, 0.0))
     rules.set(level_loose=0.5, **changes)
     rules.change("level_P", 1, 0.1)
@@ -234,7 +234,7 @@ def variances(rules, lane=0):
         ("uwb_range", (-2.0, 0.0, 0.0), (0, 1, 2), 4.0),
     ],
 )
-def test_reset_to_a_sensor_sets_the_variances_of_what_it_measures(name, nu, rows, expected):
+def test_reset_to_a_sensor_sets_the_variances_of_the_measured_states(name, nu, rows, expected):
     """To the square of the innovation, and leaves others. A flow is an angular rate."""
     rules = refused(LaneRules(ALL), name, nu=nu)
     rules.set(r_hat=[0.0, 0.0, H])
@@ -268,7 +268,7 @@ def test_reset_to_ranges_takes_the_largest_valid_one():
 
 
 def test_reset_to_features_has_the_largest_angle_and_offset():
-    """Of a feature that is near by and one that is far; one that was not seen does not count."""
+    """One feature is near by and one is far; another one that was not seen does not count."""
     features = ((2.0, 0.0, H), (0.0, 8.0, H), (0.0, 0.0, H - 1.0))
     camera = ALL.camera.replace(features_I=features, max_range=100.0)
     rules = refused(LaneRules(ALL.replace(camera=camera)), "pixels", nu=(0.3, 0.4, 0.0))
@@ -336,7 +336,7 @@ def test_heading_that_has_drifted_off_makes_the_gyro_uncertain_about_the_vertica
 
 
 @pytest.mark.parametrize(("first", "row"), [(0, 9), (3, 12)], ids=["accelerometer", "gyro"])
-def test_bias_has_jumped_when_its_corrections_are_beyond_their_deviations(first, row):
+def test_bias_has_jumped_when_its_corrections_are_beyond_their_limit(first, row):
     """Chi-square of three axes above 24, with the variance of the state over 24 added."""
     rules = LaneRules(ALL)
     sigma, removed = 0.01, 2e-5
@@ -362,7 +362,7 @@ def test_bias_has_jumped_when_its_corrections_are_beyond_their_deviations(first,
 
 @pytest.mark.parametrize("corrected", [0.002, 0.01, 0.05])
 def test_gyro_whose_bias_has_jumped_has_turned_attitude_velocity_and_position(corrected):
-    """For half of 6 s, by three times the sum, up to 0.09 rad/s; the tilt up to that of a start."""
+    """For half of 6 s, by three times the sum, up to 0.09 rad/s; the tilt up to a start's."""
     rules, imu, pose = LaneRules(ALL, np.full(5, 1e-6)), ALL.imu, ALL.initial_pose
     rules.set(R_hat=euler_to_dcm([0.3, -0.2, 1.0]))
     sums = np.zeros(len(rules.get("corrected")[0]))
@@ -436,7 +436,7 @@ def test_barometer_that_is_reset_alone_moves_the_position():
 
 @pytest.mark.parametrize("kind", ["accelerometer", "drifted"])
 def test_reset_of_the_motion_resets_hard_iron_and_drift_with_it(kind):
-    """Of the start: they were estimated with the attitude and the position."""
+    """To the start: they were estimated with the attitude and the position."""
     rules = LaneRules(DRIFTING, np.full(5, 1e-6))
     for row in range(15, 15 + rules.slow):
         rules.set_sigma(row, 1e-9)
