@@ -163,6 +163,26 @@ def test_measurements_come_with_flags_at_their_own_rates():
     np.testing.assert_array_equal(np.flatnonzero(camera), np.arange(0, 21, 2))
 
 
+def test_measurements_of_other_sensors_follow_over_their_scales():
+    suite = quad_gym.sensor_suite("rtk").simplified()
+    suite = suite.replace(
+        barometer=quad_gym.BarometerParams(rate=50.0),
+        magnetometer=quad_gym.MagnetometerParams(rate=50.0),
+        optical_flow=quad_gym.OpticalFlowParams(rate=50.0),
+    )
+    env = QuadVectorEnv(4, "hover", observation="measurements", sensors=suite)
+    env.reset(seed=2)
+    for _ in range(3):
+        observation, *_ = env.step(np.zeros((4, 4)))
+    seen = parts_of(observation, observation="measurements", sensors=suite)
+    batch = env.flights.batch
+    for name in ("barometer", "magnetometer", "optical_flow"):
+        values = batch.read(name).reshape(4, -1)
+        assert seen[f"{name}_valid"].all()
+        assert np.isfinite(values).all()
+        close(seen[name], values / getattr(suite, name).scale)
+
+
 def test_slow_controller_receives_every_fix_since_its_last_step():
     suite = quad_gym.sensor_suite("standard").with_rates(gnss=25.0)
     env = vec_env(count=2, seed=1, observation="measurements", control_rate=10, sensors=suite)

@@ -1,5 +1,8 @@
 """Dryden gusts against MIL-F-8785C: scales, discretization, variance, correlation, spectrum."""
 
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,7 +11,12 @@ from scipy.linalg import expm
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.vehicle.air import first_order, gust_scales, second_order
+from quad_gym.kernels.vehicle.air import (
+    first_order,
+    gust_scales,
+    second_order,
+    sinh_less_argument,
+)
 from quad_gym.records import Control, Source
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled
@@ -32,10 +40,11 @@ def scales(f, _):
 def filters(f, _):
     f.u = first_order(f.x, f.h, f.n)
     f.v, f.w = second_order(f.x, f.y, f.h, f.n, f.m)
+    f.excess = sinh_less_argument(f.h)
 
 
 scales_of = Compiled(scales, height=(), wind_speed=(), sigma_u=(), sigma_w=(), L_u=(), L_w=())
-filter_of = Compiled(filters, x=(), y=(), h=(), n=(), m=(), u=(), v=(), w=())
+filter_of = Compiled(filters, x=(), y=(), h=(), n=(), m=(), u=(), v=(), w=(), excess=())
 
 
 @given(st.floats(-10.0, 1000.0), st.floats(0.0, 40.0))
@@ -44,6 +53,16 @@ def test_gust_scales_match_the_specification(height, wind_speed):
     expected = military_scales(height, wind_speed)
     for name, value in zip(("sigma_u", "sigma_w", "L_u", "L_w"), expected, strict=True):
         np.testing.assert_allclose(got[name][0], value, rtol=1e-13, err_msg=name)
+
+
+def test_hyperbolic_sine_minus_its_argument_is_exact_to_a_few_units_in_the_last_place():
+    """Against the series in fractions; below one there is no cancellation."""
+    h = np.array([1e-6, 1e-3, 0.1, 0.5, 0.9, 0.999, 0.9999])
+    expected = [
+        float(sum(Fraction(x) ** k / math.factorial(k) for k in range(3, 40, 2))) for x in h
+    ]
+    for run in (filter_of.on_floats, filter_of.on_lanes):
+        np.testing.assert_allclose(run(h=h)["excess"], expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize("h", [1e-9, 1e-6, 1e-3, 0.03, 0.9, 1.1, 4.0])

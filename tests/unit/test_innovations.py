@@ -22,7 +22,7 @@ from tests.circle_flight import record_circle
 from tests.field_flights import fly, measured_now, state_errors, steps
 from tests.filter_states import set_at_rest, set_like
 from tests.lane_filter import EIGHT, STATE, LaneFilter
-from tests.reference_ukf import PlainUKF
+from tests.reference_ukf import PlainUKF, block_diagonal
 from tests.unit.alarms import ALARM
 
 LAB = quad_gym.sensor_suite("lab")
@@ -327,3 +327,38 @@ def test_nis_of_rtk_is_below_its_dimension_by_the_baselines_with_a_heading_error
         assert 0.92 < whole[0] / whole[1] < 0.95
     else:
         assert whole[0] / whole[1] == pytest.approx(1.0, abs=limit)
+
+
+class DirectionUKF(InnovatingUKF):
+    """The plain filter, with the NIS along directions, of their noise and their second order."""
+
+    def _condition(self, z, noise, models):
+        x0 = np.concatenate([self._state(), self._array(np.zeros(len(z)))])
+        points, _, w_cov = self._sigma_points(x0, block_diagonal(self.P, noise))
+        Z, n = self._predicted(models, points) + points[:, self.states :], len(x0)
+        plus, minus = (Z[1 + part * n : 1 + part * n + self.states] for part in (0, 1))
+        super()._condition(z, noise, models)
+        odd = 0.5 * (plus - minus)  # of the states; those of the noise are part of it
+        rest = self.innovation_covariance - 2.0 * w_cov[1] * odd.T @ odd
+        rows = np.zeros((len(z) // 3 - 1, len(z)))
+        for k, row in enumerate(rows, 1):  # all but the position
+            row[3 * k : 3 * k + 3] = self.prediction[3 * k : 3 * k + 3]
+        self.along = normalized_square(rows, self.innovation, rest)
+        whole = np.eye(len(z))
+        self.whole = normalized_square(whole, self.innovation, self.innovation_covariance)
+
+
+def test_nis_of_uncertain_directions_is_without_their_joint_part_along_them():
+    """From the first update on, when the second order of the prior is common to all directions."""
+    ours, plain, joint = UnscentedKalmanFilter(CONSISTENT), DirectionUKF(CONSISTENT), []
+    for ukf in (ours, plain):
+        ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    for k in range(12):
+        for ukf in (ours, plain):
+            ukf.update(RECORDING.gnss_position[k], RECORDING.gnss_baseline[k], RECORDING.pixels[k])
+        expected = plain.whole - plain.along
+        np.testing.assert_allclose(ours.nis[0], expected, rtol=1e-5, atol=1e-5)
+        joint.append(plain.along)
+        for ukf in (ours, plain):
+            ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
+    assert max(joint) > 1.0
