@@ -4,6 +4,7 @@ import numpy as np
 
 from quad_gym.kernels.entries import FILTER_ENTRIES, FILTER_STAGES, linked_table, run_stage
 from quad_gym.kernels.stages import needed_stages
+from quad_gym.packing import form_of
 from quad_gym.records import joint_covariance, lower_triangle
 from tests.lane_filter import EIGHT, LaneFilter
 
@@ -17,12 +18,14 @@ class LaneRules(LaneFilter):
         sensors: Suite of the filter.
         sigma: Standard deviations of position, velocity, attitude and biases; their errors are
             independent.
+        innovations: True for a filter that stores innovations, also without a gate.
     """
 
     tick = 100_000.0
 
-    def __init__(self, sensors, sigma=(0.1, 0.1, 0.05, 0.02, 0.002)):
+    def __init__(self, sensors, sigma=(0.1, 0.1, 0.05, 0.02, 0.002), innovations=False):
         super().__init__(sensors)
+        self.form = int(form_of(sensors, innovations))
         self.settings["form"] = self.form
         stages = needed_stages(self.settings[0])
         stages = {stage: stages[stage] for stage in FILTER_STAGES if stage in stages}

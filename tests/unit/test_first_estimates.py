@@ -1,0 +1,98 @@
+"""First estimates from a baseline, `initialize` in `quad_gym.kernels.filter.starts`."""
+
+import math
+
+import numpy as np
+import pytest
+
+from quad_gym.kernels.entries import start_filter
+from quad_gym.records import BASELINE_BLOCK, POSITION_BLOCK
+from quad_gym.rotations import euler_to_dcm
+from tests.lane_rules import LaneRules
+from tests.level_flights import MAGNETIC, R_IG
+
+PLACE = np.array([3.0, -1.0, 2.0])
+UNKNOWN = math.pi / math.sqrt(3.0)
+
+
+def started(baseline, heading, arm=(0.2, -0.1, 0.3), ahead=(0.0, 0.0, 0.0), **estimator):
+    """Filters of a level vehicle with this heading, which start from its first fix."""
+    suite = MAGNETIC.replace(magnetometer=None, barometer=None)
+    secondary = tuple(np.add(arm, baseline))
+    gnss = suite.gnss.replace(primary_antenna_B=arm, secondary_antenna_B=secondary)
+    suite = suite.replace(gnss=gnss, estimator=suite.estimator.replace(**estimator))
+    rules, R_BI = LaneRules(suite), euler_to_dcm([0.0, 0.0, heading])
+    rules.set(P=np.tril(np.ones((15, 15))), r_hat=9.0, v_hat=9.0, b_a_hat=9.0, b_g_hat=9.0)
+    rules.measured(POSITION_BLOCK, (PLACE + R_BI.T @ arm) @ R_IG)
+    rules.measured(BASELINE_BLOCK, (R_BI.T @ np.array(baseline)) @ R_IG)
+    rules.settings["heading_sensor"] = -1
+    for block, params, settings, work in rules._each((True,) * 8):
+        start_filter(block, params, settings, work, np.array(ahead))
+    return suite, rules, R_BI
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.2, -2.5])
+@pytest.mark.parametrize(
+    ("baseline", "share"),
+    [((0.4, 0.0, 0.0), 1.0), ((-0.1, 0.3, 0.0), 1.0), ((0.3, 0.0, 0.4), 0.6)],
+    ids=["ahead", "aside", "steep"],
+)
+def test_level_start_has_the_heading_of_the_baseline_and_its_covariance(heading, baseline, share):
+    """The steeper the baseline, the less certain the heading. The antenna ties the
+    position to it."""
+    scale = 2.0
+    suite, rules, R_BI = started(baseline, heading, initial_covariance_scale=scale)
+    gnss, estimator, imu = suite.gnss, suite.estimator, suite.imu
+    np.testing.assert_allclose(rules.get("R_hat")[0], R_BI, atol=1e-12)
+    np.testing.assert_allclose(rules.get("r_hat")[0], PLACE, atol=1e-12)
+    for name in ("v_hat", "b_a_hat", "b_g_hat"):
+        np.testing.assert_array_equal(rules.get(name), 0.0)
+    first = float(rules.params["first_baseline_sigma"][0, 0])
+    P = np.zeros((15, 15))
+    P[3:6, 3:6] = estimator.initial_velocity_variance * np.eye(3)
+    tilt, psi = estimator.initial_tilt_sigma**2, scale * (first / share) ** 2
+    P[6:9, 6:9] = np.diag([tilt, tilt, psi])
+    P[9:12, 9:12] = imu.accel_bias_sigma**2 * np.eye(3)
+    P[12:, 12:] = imu.gyro_bias_sigma**2 * np.eye(3)
+    # r = antenna - R^T l, with R = R(e) R_hat, where R(e) = I - [e x] to first order
+    axes = np.eye(3)
+    J = np.column_stack([R_BI.T @ np.cross(gnss.primary_antenna_B, axis) for axis in axes])
+    P[:3, 6:9] = J @ P[6:9, 6:9]
+    P[6:9, :3] = P[:3, 6:9].T
+    P[:3, :3] = scale * np.diag(np.square(gnss.position_sigma_I)) + J @ P[6:9, 6:9] @ J.T
+    np.testing.assert_allclose(rules.covariance()[0], P, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("share", [0.19, 0.21])
+def test_baseline_within_12_degrees_of_the_vertical_needs_another_heading(share, known):
+    """The place of the start shows it, with its own standard deviation, or nothing does."""
+    baseline = 0.5 * np.array([share, 0.0, math.sqrt(1.0 - share**2)])
+    ahead = (math.cos(0.7), math.sin(0.7), 0.0) if known else (0.0, 0.0, 0.0)
+    suite, rules, _ = started(tuple(baseline), 0.3, ahead=ahead)
+    placed = known and share < 0.2
+    heading = 0.7 if placed else 0.3
+    np.testing.assert_allclose(rules.get("R_hat")[0], euler_to_dcm([0.0, 0.0, heading]), atol=1e-12)
+    first = float(rules.params["first_baseline_sigma"][0, 0])
+    sigma = min(first / share, UNKNOWN)
+    if placed:
+        sigma = suite.initial_pose.heading_sigma
+    sigma *= math.sqrt(suite.estimator.initial_covariance_scale)
+    np.testing.assert_allclose(np.sqrt(rules.covariance()[:, 8, 8]), sigma, rtol=1e-9)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_vertical_baseline_shows_no_heading(known):
+    ahead = (math.cos(0.7), math.sin(0.7), 0.0) if known else (0.0, 0.0, 0.0)
+    for tilt in (None, MAGNETIC.estimator.initial_tilt_sigma):
+        suite, rules, _ = started((0.0, 0.0, 0.4), 0.3, ahead=ahead, initial_tilt_sigma=tilt)
+        scale = math.sqrt(suite.estimator.initial_covariance_scale)
+        sigma = scale * suite.initial_pose.heading_sigma if known else UNKNOWN
+        np.testing.assert_allclose(np.sqrt(rules.covariance()[:, 8, 8]), sigma, rtol=1e-9)
+        if known:
+            R_BI = euler_to_dcm([0.0, 0.0, 0.7])
+            np.testing.assert_allclose(rules.get("R_hat")[0], R_BI, atol=1e-9)
+        attitude = scale * float(rules.params["first_baseline_sigma"][0, 0])
+        np.testing.assert_allclose(
+            np.sqrt(rules.covariance()[:, 6, 6]), tilt or attitude, rtol=1e-9
+        )
