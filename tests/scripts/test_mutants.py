@@ -2,10 +2,12 @@
 
 import ast
 import csv
+import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,6 +58,34 @@ def test_tests_that_name_the_function_are_nearer():
     texts["tests/test_near.py"] = "image"
     texts["tests/test_direct.py"] = "reset_fix(flight)"
     assert mutants.nearest_tests(mutant, 2, texts) == ["tests/test_direct.py", "tests/test_near.py"]
+
+
+def test_many_parameters_of_one_test_leave_room_for_those_of_other_files(monkeypatch):
+    def first():
+        return "gnss baseline"
+
+    def second():
+        return "gnss"
+
+    def third():
+        return "image"
+
+    def fourth():
+        return "other"
+
+    items = [SimpleNamespace(function=first, path="a", number=k) for k in range(50)]
+    items += [SimpleNamespace(function=second, path="a", number=k) for k in range(50)]
+    items += [SimpleNamespace(function=f, path="b", number=0) for f in (third, fourth)]
+    weights = [("gnss", 1.0), ("baseline", 2.0), ("image", 0.01)]
+    monkeypatch.setenv(mutants._WORDS_OF, json.dumps(weights))
+    monkeypatch.setattr(mutants, "_FIRST", 2)
+    monkeypatch.setattr(mutants, "_MOST", 7)
+    mutants.pytest_collection_modifyitems(items)
+    chosen = [(item.function.__name__, item.number) for item in items]
+    assert chosen == [
+        ("first", 0), ("first", 1),  # the nearest, then others by file
+        ("first", 2), ("second", 0), ("second", 1), ("third", 0), ("fourth", 0),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
