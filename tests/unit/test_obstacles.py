@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 import quad_gym
 from quad_gym import Cylinder, Wall, WorldParams
 from quad_gym.batch.starts import hidden_points, nearest_obstacle, require_room
-from quad_gym.records import FEATURE_SLICE, MAX_OBSTACLES, Ending, Source
+from quad_gym.records import FEATURE_SLICE, MAX_OBSTACLES, WIDTH, Ending, Source
 from tests.builders import batch as batch_of
 
 WALL = Wall(center_I=(0.5, -0.2, 1.0), size=(3.0, 0.6, 2.0), yaw=0.7)
@@ -126,6 +126,19 @@ def test_marks_on_a_wall_are_hidden_from_behind():
     assert hidden[1].all()
 
 
+@pytest.mark.parametrize(("depth", "hides"), [(0.5e-3, False), (1.5e-3, True)])
+def test_points_up_to_a_millimeter_inside_an_obstacle_are_seen(depth, hides):
+    """From any distance, and from nearer than that, through each kind of surface."""
+    box, mast = Wall(size=(4.0, 2.0, 6.0)), Cylinder(radius=1.0, height=2.0)
+    for obstacle, faces in ((box, np.diag([2.0, 1.0, 3.0])), (mast, np.eye(3))):
+        for face in faces:
+            outward = face / np.linalg.norm(face)
+            for side, far in ((1.0, 8.0), (-1.0, 0.3)):
+                eye, point = side * (face + far * outward), side * (face - depth * outward)
+                found = hidden_points([obstacle], np.zeros((1, 1, 3)), eye[None], point[None])
+                assert found.item() == hides
+
+
 TRUTH = {"source": Source.TRUTH, "threads": 1}
 
 
@@ -193,6 +206,25 @@ def test_leaving_the_geofence_ends_an_episode():
         np.testing.assert_array_equal(batch.result("ending") == Ending.LEFT_GEOFENCE, outside)
     assert outside.any()
     assert np.isinf(batch.record("obstacle_distance")).all()
+
+
+def test_each_side_of_the_geofence_ends_an_episode():
+    low, high = np.array([-9.0, -8.0, -1.0]), np.array([9.0, 7.0, 4.0])
+    batch = batch_of(12, world=WorldParams(geofence=(tuple(low), tuple(high))), **TRUTH)
+    places = np.tile([1.0, 2.0, 3.0], (12, 1))
+    beyond = np.resize([0.01, -0.01], 12)
+    for k in range(12):
+        axis, side = k // 2 % 3, k // 6
+        places[k, axis] = high[axis] + beyond[k] if side else low[axis] - beyond[k]
+    batch.step()
+    flights = batch.snapshot()
+    flights["left_fence"] = 0.0
+    for k, place in enumerate(places):
+        flights["r"][k // WIDTH, :, k % WIDTH] = place
+        flights["v"][k // WIDTH, :, k % WIDTH] = 0.0
+    batch.restore(flights)
+    batch.step()
+    np.testing.assert_array_equal(batch.record("left_fence"), beyond > 0.0)
 
 
 def test_obstacles_hide_features_and_change_nothing_else():
