@@ -15,11 +15,13 @@ from quad_gym.records import (
     AID_BLOCK,
     AID_GROUPS,
     BASELINE_BLOCK,
+    FEATURE_BLOCKS,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     Aid,
     GateDecision,
 )
+from quad_gym.rotations import euler_to_dcm
 from tests.lane_filter import EIGHT
 from tests.lane_rules import NEVER, LaneRules
 from tests.level_flights import MAGNETIC, R_IG
@@ -31,7 +33,9 @@ GATE, GATE_OF_RANGES = stats.chi2.isf(ALARM, 3), stats.chi2.isf(ALARM, 1)
 NOW, SECOND = LaneRules.tick, SUITE.imu.rate
 ANCHORS = ((10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (-10.0, 0.0, 0.0), (0.0, -10.0, 0.0),
            (0.0, 0.0, 10.0), (0.0, 0.0, -10.0))  # fmt: skip
+NOISE_OF_RANGES = quad_gym.UwbRangeParams().noise_sigma
 RANGES, GROUP = AID_BLOCK[Aid.UWB_RANGE], AID_GROUPS + Aid.UWB_RANGE
+FEATURE_GROUP = AID_GROUPS - 1
 ACCEPTED, REJECTED, WEAKENED = (
     int(GateDecision[name]) for name in ("ACCEPTED", "REJECTED", "WEAKENED")
 )
@@ -200,6 +204,10 @@ def test_ranges_beyond_the_gate_are_rejected_while_most_agree():
         accepted = rules.get("accepted_tick")[:, GROUP]
         np.testing.assert_array_equal(accepted, np.where(refused, NEVER, NOW))
         np.testing.assert_array_equal(rules.get("stepped")[:, GROUP], 0.0)
+        found = rules.get("innovation")[:, RANGES : RANGES + 6]
+        np.testing.assert_allclose(found[:, :, 0], np.sqrt(nis) * NOISE_OF_RANGES, rtol=1e-6)
+        found = np.stack([found, rules.get("innovation_sigma")[:, RANGES : RANGES + 6]])
+        np.testing.assert_array_equal(np.isnan(found), np.broadcast_to([0, 1, 1], found.shape))
 
 
 def ratio_of(nis_per_freedom):
@@ -295,3 +303,100 @@ def test_largest_nis_counts_as_ten_times_its_freedoms():
     rules, _ = located(GATE * np.array([0.2, 0.9, 1.2, 1.4, 1.5, 2.0, 3.0, 3.9]))
     expected = GATE * np.array([0.2, 0.9, 1.2, 1.4, 1.5, 2.0, 3.0, 3.9]) / 3.0
     np.testing.assert_allclose(rules.get("nis_ratio"), ratio_of(expected), rtol=1e-6)
+
+
+# --------------------------------------------------------------------------------------------------
+# Support by a camera, and features whose prediction is too uncertain.
+# --------------------------------------------------------------------------------------------------
+
+CAMERA = quad_gym.CameraParams(
+    position_B=(0.0, 0.0, 0.0), attitude=(math.pi / 2.0, 0.0, math.pi / 2.0),
+    features_I=((4.0, 0.0, 0.0), (4.0, 1.0, 0.5)),
+)  # fmt: skip
+
+
+def looking(sigma, **estimator):
+    """Flights whose attitude has a standard deviation, with features in view."""
+    suite = SUITE.replace(camera=CAMERA, estimator=SUITE.estimator.replace(**estimator))
+    rules = LaneRules(suite, (1e-6, 1e-6, 1e-6, 1e-6, 1e-6))
+    P = rules.covariance()
+    P[:, [6, 7, 8], [6, 7, 8]] = np.square(np.broadcast_to(sigma, EIGHT))[:, np.newaxis]
+    rules.set_covariance(P)
+    return rules
+
+
+def test_position_that_a_camera_refutes_is_rejected_and_is_no_evidence_of_divergence():
+    """The features were accepted within the last second."""
+    rules = looking(1e-6)
+    off = np.zeros((EIGHT, 3))
+    off[:, 0] = GNSS.position_sigma_I[0] * math.sqrt(2.0 * GATE)
+    rules.measured(POSITION_BLOCK, off @ R_IG)
+    ago = np.repeat([0.99, 1.01], 4)
+    rules.change("accepted_tick", FEATURE_GROUP, NOW - ago * SECOND)
+    rules.run(Stage.UPDATE)
+    refuted = ago < 1.0
+    decision = np.where(refuted, REJECTED, WEAKENED)
+    np.testing.assert_array_equal(rules.get("gate")[:, POSITION_BLOCK], decision)
+    ratio = np.where(refuted, 1.0, ratio_of(2.0 * GATE / 3.0))
+    np.testing.assert_allclose(rules.get("nis_ratio"), ratio, rtol=1e-6)
+    np.testing.assert_array_equal(rules.get("r_hat")[:, 0] == 0.0, refuted)
+
+
+def test_feature_whose_direction_is_too_uncertain_is_left_out_and_counts_as_nothing():
+    """The sum of its two predicted variances is beyond the square of a limit."""
+    rules = looking(np.linspace(0.05, 0.7, EIGHT), max_direction_sigma=0.5)
+    for i, feature in enumerate(np.array(CAMERA.features_I)):
+        x, y, z = euler_to_dcm(CAMERA.attitude) @ feature
+        pixel = CAMERA.focal_length / z * np.array([x, y, 0.0])
+        assert z > 0.0
+        rules.measured(FEATURE_BLOCKS + i, pixel)
+    before = rules.covariance()
+    rules.run(Stage.UPDATE)
+    for i in range(2):
+        sigma = rules.get("innovation_sigma")[:, FEATURE_BLOCKS + i, :2]
+        unsure = (sigma**2).sum(axis=1) > 0.5**2
+        assert 2 <= unsure.sum() <= 6
+        expected = np.where(unsure, int(GateDecision.UNSURE), ACCEPTED)
+        np.testing.assert_array_equal(rules.get("gate")[:, FEATURE_BLOCKS + i], expected)
+        np.testing.assert_array_equal(rules.get("rejections")[:, FEATURE_BLOCKS + i], 0.0)
+    np.testing.assert_array_equal(rules.covariance()[unsure], before[unsure])
+    assert (rules.covariance()[~unsure, 7, 7] < before[~unsure, 7, 7]).all()
+    accepted = rules.get("accepted_tick")[:, FEATURE_GROUP]
+    np.testing.assert_array_equal(accepted, np.where(unsure, NEVER, NOW))
+    np.testing.assert_array_equal(rules.get("nis_ratio") == 1.0, unsure)
+
+
+# --------------------------------------------------------------------------------------------------
+# A new episode.
+# --------------------------------------------------------------------------------------------------
+
+
+def test_start_forgets_all_that_gate_and_rules_of_the_heading_have_seen():
+    rules = LaneRules(SUITE)
+    zero = [
+        "accepted_tick", "refused_tick", "stepped", "diverged", "rejections", "rejected_in_row",
+        "resets", "gate", "corrected", "corrected_variance", "level_phase", "level_force",
+        "level_sum", "level_last", "level_misses", "level_fresh", "level_against", "level_doubts",
+        "level_lean", "compass_out", "compass_agrees", "heading_lost", "level_apart",
+        "level_sigma", "level_first", "level_loose", "compass_leapt", "prediction_failures",
+        "update_failures", "nis", "nis_dimension", "v_corrected", "arc",
+    ]  # fmt: skip
+    expected = {
+        **dict.fromkeys(zero, 0.0),
+        **dict.fromkeys(("block_nis", "innovation", "innovation_sigma"), np.nan),
+        **dict.fromkeys(("noise_factor", "nis_ratio"), 1.0),
+        **dict.fromkeys(("alarm_tick", "level_tick"), NEVER),
+        "corrected_tick": NOW,
+        "filter_status": 0,
+    }
+    rules.set(**dict.fromkeys(set(expected) - {"filter_status"}, 7.0))
+    rules.blocks["filter_status"] = 3
+    rules.set(r_hat=0.0, tick=NOW)
+    rules.measured(POSITION_BLOCK, np.zeros(3))
+    first = np.arange(EIGHT) < 4
+    rules.initialize(first)
+    for name, value in expected.items():
+        found = rules.get(name)
+        np.testing.assert_array_equal(found[first], np.full_like(found[first], value), name)
+        kept = 3 if name == "filter_status" else 7.0
+        assert (found[~first] == kept).all(), name

@@ -158,8 +158,11 @@ def test_attitude_is_reset_after_contradictions_in_a_row(field, off, before, res
 @pytest.mark.parametrize("sigma", [0.155, 0.165])
 def test_contradicted_heading_is_reset_by_the_motion_if_this_is_sharp_else_unknown(sigma):
     """The limit is 0.16 rad. Only the former confirms the heading."""
-    rules = judged(math.pi, sigma, level_against=2.0, heading=0.3, compass_agrees=1.0)
+    rules = compared(math.pi, sigma, level_against=2.0, heading=0.3, compass_agrees=1.0)
+    rules.change("level_state", 0, 1.5)
+    rules.run(Stage.HEADING)
     sharp = sigma < 0.16
+    np.testing.assert_allclose(rules.get("v_hat")[:, 0], 1.5 if sharp else 0.0)
     heading = 0.3 + math.pi if sharp else 0.3
     np.testing.assert_allclose(rules.get("R_hat")[0], euler_to_dcm([0, 0, heading]), atol=1e-9)
     np.testing.assert_array_equal(rules.get("heading_lost"), 0.0 if sharp else 1.0)

@@ -130,9 +130,11 @@ def test_first_fix_and_three_misses_in_a_row_begin_velocity_heading_and_leveling
     """u = 0 with P_uu = 1. The variance of d is gravity times the filter's tilt, and 0.3 m/s^2."""
     rng = np.random.default_rng(2)
     rules, _ = begun(rng, level_phase=phase, level_misses=misses, level_loose=0.2)
-    covariances = rules.covariance()
-    covariances[:, 6:9, 6:9] = np.diag([0.2, 0.03, 0.5]) ** 2
+    R_BI, covariances = euler_to_dcm([0.5, -0.4, 1.0]), rules.covariance()
+    axes = np.column_stack([*np.linalg.svd(R_BI[np.newaxis, :, 2])[2][1:], R_BI[:, 2]])
+    covariances[:, 6:9, 6:9] = axes @ np.diag([0.2, 0.03, 0.5]) ** 2 @ axes.T
     rules.set_covariance(covariances)
+    rules.set(R_hat=R_BI)
     velocities = rng.standard_normal((EIGHT, 2))
     sums = rules.get("level_last") + np.array([1.0, 2.0, 0.3])
     followed(rules, sums, velocities)
@@ -207,6 +209,7 @@ def test_velocity_begins_after_two_seconds_without_a_fix_and_the_heading_stays(T
     assert_same(rules, plain)
     np.testing.assert_array_equal(rules.get("level_loose"), 1.0)
     np.testing.assert_array_equal(rules.get("level_misses"), 0.0)
+    np.testing.assert_array_equal(rules.get("level_fresh"), 1.0)
     np.testing.assert_array_equal(rules.get("level_last"), sums)
 
 
@@ -322,3 +325,4 @@ def test_level_frame_turns_with_the_gyro_and_adds_up_the_force(confirmed):
     turned = W.T @ np.cross(gyro - kf.gyro_bias, arm)
     np.testing.assert_allclose(read("level_sum")[0, :2], sums + turned[:2], rtol=1e-4)
     assert read("level_phase")[0] == 1.0
+    assert read("level_last")[0, 2] == pytest.approx(dt)  # earlier velocities do not count
