@@ -9,7 +9,7 @@ from scripts.estimate_bench.entries import FILE, Entry
 from scripts.estimate_bench.rows import MEMORY, SEEDS, arms_of
 from scripts.estimate_bench.tasks import TASKS, BenchTask
 from scripts.studies.campaign import DATA, flights_digest
-from scripts.studies.conclusions import LINE, NOT_MEASURED, verdict
+from scripts.studies.conclusions import LINE, NOT_MEASURED, p_value
 from scripts.studies.report import number, share
 from scripts.studies.rows import Effect, Rows, effect
 
@@ -137,9 +137,8 @@ def effects(measured: Rows) -> str:
 
 def _cell(found: Effect) -> str:
     """Effect and p, in bold if it is significant."""
-    p = verdict(found).removesuffix(", not significant")
     size = number(found.size, 0)
-    return f"**{size}**{LINE}{p}" if found.significant else f"{size}{LINE}{p}"
+    return LINE.join(filter(None, (f"**{size}**" if found.significant else size, p_value(found))))
 
 
 def summary(measured: Rows) -> str:

@@ -48,12 +48,24 @@ def points(found: Effect, separator: str = " ") -> str:
 LINE = "<br>"  #: separator in cells of tables, so that these are narrow
 
 
-def verdict(found: Effect) -> str:
-    """P value of a difference, and where it is not significant, this word."""
+def p_value(found: Effect) -> str:
+    """P value of a difference; empty where an arm is a fixed rule."""
     if found.p is None:
-        return "significant" if found.significant else "not significant"
-    p = "p < 0.001" if found.p < 0.001 else f"p = {found.p:.2g}"
-    return p if found.significant else f"{p}, not significant"
+        return ""
+    return "p < 0.001" if found.p < 0.001 else f"p = {found.p:.2g}"
+
+
+def findings(found: Effect) -> tuple[str, ...]:
+    """P value of a difference, and whether it is significant where the p value does not say it."""
+    p, word = p_value(found), "significant" if found.significant else "not significant"
+    if not p:
+        return (word,)
+    return (p,) if found.significant else (p, word)
+
+
+def verdict(found: Effect) -> str:
+    """The same as words in a sentence."""
+    return ", ".join(findings(found))
 
 
 def table(heads: Sequence[str], body: Sequence[Sequence[str]], texts: int = 1) -> str:
@@ -376,7 +388,7 @@ def when_to_train(rows: Rows) -> str:
             _shown(case.rule.estimated(case.column), case.column),
             _shown(case.ideal.estimated(case.column), case.column),
             _shown(case.cost.size, case.column),
-            LINE.join([_shown(case.gain.size, case.column), *verdict(case.gain).split(", ")]),
+            LINE.join([_shown(case.gain.size, case.column), *findings(case.gain)]),
             f"{case.seeds}",
         ]
         for case in cases(rows)
