@@ -16,9 +16,7 @@ from quad_gym.envs import (
 )
 from quad_gym.envs.keywords import EnvKeywords
 from quad_gym.params import sensor_table
-from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import LogUniform, Normal, Randomization, Uniform
 from quad_gym.params.sensor_table import *  # noqa: F403
@@ -94,7 +92,6 @@ __all__ = [
     "IDS",
     "ActionParams",
     "BatteryParams",
-    "CameraParams",
     "Cylinder",
     "Ending",
     "EnvKeywords",
@@ -104,7 +101,6 @@ __all__ = [
     "Flight",
     "FlightBatch",
     "FlightRecorder",
-    "GnssParams",
     "GroundParams",
     "ImuParams",
     "InitialPoseParams",

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.params.portable import norm
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, in_words
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import FAULT_KINDS, Aid, FaultKind, FieldFault
 
@@ -60,8 +60,6 @@ __all__ = [
 # --------------------------------------------------------------------------------------------------
 # The base of all faults: start, duration and rate, sizes and directions.
 # --------------------------------------------------------------------------------------------------
-
-_SENSORS = {"gnss": "GNSS"}  #: parts of a suite that are named without an article
 
 Span = float | tuple[float, float]
 """A number, or a range (low, high) from which it is drawn uniformly at each onset of a fault."""
@@ -158,10 +156,9 @@ class Fault(Checked):
     def check_suite(self, sensors: SensorSuite) -> None:
         """Refuse a sensor suite that lacks the sensor of the fault."""
         if self.needs and getattr(sensors, self.needs) is None:
-            what = _SENSORS.get(self.needs, f"a {self.needs}")
             raise ValueError(
-                f"faults must concern sensors of the suite: {type(self).__name__} needs {what}, "
-                f"which this sensor suite does not have"
+                f"faults must concern sensors of the suite: {type(self).__name__} needs "
+                f"{in_words(self.needs)}, which this sensor suite does not have"
             )
 
 

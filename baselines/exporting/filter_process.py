@@ -29,7 +29,7 @@ from quad_gym.kernels.library import core_symbol, say
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.logs.formats.log import mounting_of
 from quad_gym.logs.replaying.results import COLUMNS
-from quad_gym.params.sensor_table import READINGS
+from quad_gym.params.sensor_table import READINGS, SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES, SensorSuite
 from quad_gym.records import (
     BLOCKS_OF,
@@ -75,7 +75,6 @@ _RECORDS = {
     "memory": MEMORY,
 }
 """Records in the memory of an exported filter, by their names there."""
-_PLACES = ("gnss_position",)  #: readings that stay in double precision
 _OUTCOMES = {
     Outcome.OK: "done",
     Outcome.NOT_STARTED: "call an init function first",
@@ -272,8 +271,7 @@ class Sources:
                 f'    if (!strcmp(name, "{sensor}"))\n        {self._row_of(sensor)};\n    else\n'
                 for sensor in names
             ),
-            "GNSS": suite.gnss is not None,
-            "BAROMETER": suite.barometer is not None,
+            **{name.upper(): name in names for name in SENSOR_PARAMS},
         }
 
     def _texts_of(self, name: str) -> dict[str, str]:
@@ -284,7 +282,7 @@ class Sources:
         frame = ", in G" if reading.in_G else ""
         note = f"{reading.meaning}{frame} [{reading.unit}]"
         note += "; NAN: not measured" if reading.most_blocks > 1 else ""
-        kind, put = ("double", "qgi_place") if name in _PLACES else ("qg_real", "qgi_value")
+        kind, put = ("double", "qgi_place") if reading.from_center else ("qg_real", "qgi_value")
         value = f"const {kind} {name}[{numbers}]" if numbers > 1 else f"{kind} {name}"
         sigma = f"const qg_real *{reading.sigma}" if several else f"qg_real {reading.sigma}"
         of_sigma = f"{reading.sigmas} standard deviations" if several else "standard deviation"
@@ -324,7 +322,7 @@ class Sources:
         taken, place = [], 1
         for reading in readings:
             if self.suite.blocks_of(reading.name):
-                numbers = "given" if reading.name in _PLACES else "value"
+                numbers = "given" if reading.from_center else "value"
                 taken.append(f"m.{reading.name} = {numbers}({place})")
                 if reading.reported:
                     number = "value" if reading.sigmas > 1 else "number"

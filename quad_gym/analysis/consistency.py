@@ -198,7 +198,7 @@ class NeesRecorder:
 
 
 SENSOR_BLOCKS = {
-    (READINGS[name].block or name.removeprefix("gnss_")): tuple(range(blocks.start, blocks.stop))
+    READINGS[name].label: tuple(range(blocks.start, blocks.stop))
     for name, blocks in records.BLOCKS_OF.items()
 }
 """Blocks of the measurement by sensor. Errors of features in one image are correlated through
@@ -434,7 +434,7 @@ def measure_consistency(
         tracking=tracking.result(),
         astray=astray,
         failed=int((batch.record("filter_status") != 0).sum()),
-        counted_as_noise=frozenset({"baseline"} if batch.sensors.heading_errs else ()),
+        counted_as_noise=frozenset(READINGS[name].label for name in batch.sensors.counted_as_noise),
     )
 
 

@@ -14,7 +14,7 @@ from quad_gym.kernels import entries
 from quad_gym.packing import pack_obstacles, slow_states
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.gnss import MIN_DRIFT
+from quad_gym.params.aids import MIN_DRIFT
 from quad_gym.params.randomization import DrawingTable
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.task import TaskParams
@@ -589,8 +589,8 @@ def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfigurat
     order = np.argsort(shown_rows(states))
     settings["warm_root"][:states, :draws] = W[order]
     settings["warm_covariance"][:states, :states] = portable.product(W[order], W[order].T)
-    if c.flown_sensors.gnss is not None:
-        settings["warm_drift_sigma"] = c.flown_sensors.gnss.drift_after(WARM_UP)
+    drift = c.flown_sensors.drift_after(WARM_UP)
+    settings["warm_drift_sigma"][: len(drift)] = drift
 
 
 @functools.lru_cache(maxsize=64)
@@ -700,8 +700,8 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     imu = sensors.imu
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
     slow = np.array([error.sigma for error in slow_states(sensors).errors])
-    if sensors.gnss is not None and sensors.drifts:
-        slow[:3] = np.maximum(sensors.gnss.drift_after(WARM_UP), MIN_DRIFT)
+    drift = sensors.drift_after(WARM_UP)
+    slow[: len(drift)] = np.maximum(drift, MIN_DRIFT)
     sigma = np.concatenate([sigma, slow])
     W = np.zeros((len(P), WARM_DRAWS + 2 * len(slow)))
     with_truth = P[:, 9:] / sigma

@@ -15,6 +15,11 @@ OBSERVED = ("position", "height", "velocity", "heading")
 """States that a sensor can observe: the horizontal position, and with it often the velocity."""
 
 
+MIN_DRIFT = 1e-6
+"""Drift that a filter assumes in an axis without drift if another axis has some, in the unit of the
+measurement, so that its covariance stays regular."""
+
+
 class SlowError(NamedTuple):
     """A time-correlated or constant error, which the filter estimates in augmented states."""
 
@@ -47,6 +52,7 @@ class ReadingDefinition(NamedTuple):
     most_blocks: int = 1  #: largest number of blocks
     raw_first: int = 0  #: number of the first of several blocks in raw observations
     block: str = ""  #: word for one of several blocks; empty: the name
+    word: str = ""  #: short name in reports of one sensor; empty: that of a block
     direction: bool = False
     """True if filters compare unit vectors, which have three numbers and two degrees of freedom"""
     in_G: bool = False  #: True if records have it in G, the frame of GNSS, in place of I
@@ -54,13 +60,20 @@ class ReadingDefinition(NamedTuple):
     least_sigma: float = 1e-12  #: smallest standard deviation of a measurement
     reported: bool = False  #: True if receivers report it with every measurement
     noise: str = "noise_sigma"  #: field of the parameters with the white noise
-    from_center: bool = False  #: True for a place that logs have from the center of the Earth
+    from_center: bool = False
+    """True for a place from the center of the Earth, in logs and in exported filters, which keep it
+    in double precision"""
     marked: bool = False
     """True if the mark from which a vehicle starts gives it where there is no such sensor"""
 
     def name_of(self, k: int) -> str:
         """Return the name of block k."""
         return f"{self.block or self.name}_{k}" if self.most_blocks > 1 else self.name
+
+    @property
+    def label(self) -> str:
+        """Short name in reports."""
+        return self.word or self.block or self.name
 
     @property
     def together(self) -> str:
@@ -94,6 +107,8 @@ class SensorBase(Checked):
 
     measures: ClassVar[tuple[ReadingDefinition, ...]] = ()
     """Quantities of a sensor that has several, or more to say than `AidParams`."""
+    words: ClassVar[str] = ""
+    """The sensor in messages; empty: an article and its name, such as "a barometer\""""
     _ideal: ClassVar[Mapping[str, Any]] = {}
     """Values without latency and without errors that the filter does not model."""
 
@@ -116,6 +131,18 @@ class SensorBase(Checked):
     def drift(self) -> tuple[SlowError, ...]:
         """Slow errors that are zero at the start, and come first among the states of a filter."""
         return ()
+
+    def drift_after(self, time: float) -> tuple[float, ...]:
+        """Return the standard deviations of `drift` a time [s] after it was zero."""
+        return ()
+
+    @property
+    def counted_as_noise(self) -> tuple[str, ...]:
+        """Readings with a constant error that the filter models as white noise."""
+        return ()
+
+    def require_filter(self) -> None:
+        """Refuse parameters with which a filter would overflow."""
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -163,6 +190,7 @@ class AidParams(SensorBase):
     length: ClassVar[int] = 1
     most_blocks: ClassVar[int] = 1
     rows: ClassVar[int] = 1  #: triples in `numbers`
+    shows_heading: ClassVar[bool] = False  #: True if its stage can initialize the heading
     observes: ClassVar[tuple[str, ...]]  #: these six as in `ReadingDefinition`
     unit: ClassVar[str]
     frame: ClassVar[str]

@@ -8,11 +8,7 @@ import numpy as np
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import ReadingDefinition, SensorBase, SlowError
-
-MIN_DRIFT = 1e-6
-"""Position drift that a filter assumes in an axis without drift if another axis has some [m], so
-that its covariance stays regular."""
+from quad_gym.params.aids import MIN_DRIFT, ReadingDefinition, SensorBase, SlowError
 
 HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
@@ -72,6 +68,7 @@ class GnssParams(SensorBase):
     measures: ClassVar = (
         ReadingDefinition(
             name="gnss_position",
+            word="position",
             length=3,
             unit="m",
             frame="I",
@@ -90,6 +87,7 @@ class GnssParams(SensorBase):
         ),
         ReadingDefinition(
             name="gnss_baseline",
+            word="baseline",
             length=3,
             unit="m",
             frame="I",
@@ -105,6 +103,7 @@ class GnssParams(SensorBase):
         ),
         ReadingDefinition(
             name="gnss_velocity",
+            word="velocity",
             length=3,
             unit="m/s",
             frame="I",
@@ -119,6 +118,7 @@ class GnssParams(SensorBase):
         ),
     )
     _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
+    words = "GNSS"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -175,10 +175,10 @@ class GnssParams(SensorBase):
             return ()
         return tuple(SlowError(max(s, MIN_DRIFT), self.drift_tau) for s in self.drift_sigma_I)
 
-    def drift_after(self, time: float) -> np.ndarray:
-        """Standard deviation (3,) of the drift a time [s] after it was zero [m]."""
-        share = portable.approached(2.0 * time / self.drift_tau)
-        return np.array(self.drift_sigma_I) * math.sqrt(share)
+    def drift_after(self, time: float) -> tuple[float, ...]:
+        """Return the standard deviations (3,) of the drift a time [s] after it was zero [m]."""
+        grown = math.sqrt(portable.approached(2.0 * time / self.drift_tau))
+        return tuple(sigma * grown for sigma in self.drift_sigma_I) if self.drifts else ()
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -213,6 +213,11 @@ class GnssParams(SensorBase):
     def heading_errs(self) -> bool:
         """True if baselines have a constant error, which the filter models as white noise."""
         return self.has_baseline and self.heading_error_sigma > 0.0
+
+    @property
+    def counted_as_noise(self) -> tuple[str, ...]:
+        """Baselines, if they have a constant error."""
+        return ("gnss_baseline",) if self.heading_errs else ()
 
     @property
     def first_baseline_sigma(self) -> float:

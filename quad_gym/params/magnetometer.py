@@ -45,7 +45,7 @@ class MagnetometerParams(AidParams):
 
     _ideal: ClassVar = {"latency": 0.0, "soft_iron_sigma": 0.0}
     length, observes = 3, ("heading",)
-    reads_velocity = False
+    reads_velocity, shows_heading = False, True
     unit, frame, meaning = "T", "B", "magnetic field"
     raw = ("of the field", "B", 10.0)
 

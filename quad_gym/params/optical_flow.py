@@ -23,7 +23,7 @@ class OpticalFlowParams(AidParams):
     max_rate: check.Positive = 7.4
     """largest rate, per axis [rad/s]; PixArt PMW3901 data sheet"""
 
-    length, observes = 2, ("velocity",)
+    words, length, observes = "optical flow", 2, ("velocity",)
     unit, frame, meaning = "rad/s", "B", "angular rate of the ground below"
     raw = ("rad/s", "B", 20.0)
 

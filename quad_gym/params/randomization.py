@@ -18,7 +18,7 @@ from quad_gym.params import checks as check
 from quad_gym.params import portable
 from quad_gym.params.checks import Checked
 from quad_gym.params.gnss import check_baseline
-from quad_gym.params.sensor_table import SENSOR_PARAMS
+from quad_gym.params.sensor_table import SENSOR_PARAMS, in_words
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import (
     RK4_LIMIT,
@@ -512,8 +512,7 @@ def _range_in_words(drawable: Drawable) -> str:
 
 
 _MISSING = {
-    "camera": "a camera",
-    "gnss": "GNSS",
+    **{name: in_words(name) for name in SENSOR_PARAMS},
     "antennas": "GNSS with two antennas",
     "battery": "a battery (WorldParams.battery)",
 }

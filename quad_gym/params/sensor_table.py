@@ -72,6 +72,11 @@ SENSOR_OF: dict[str, str] = {
 """Sensors by the names of their readings."""
 
 
+def in_words(sensor: str) -> str:
+    """Return a sensor in messages, such as "a barometer"."""
+    return SENSOR_PARAMS[sensor].words or f"a {sensor.replace('_', ' ')}"
+
+
 class ReadingShape(NamedTuple):
     """Properties of a reading for which records and kernels are made; see `ReadingDefinition`."""
 
@@ -124,4 +129,4 @@ def _require_complete(kind: type[AidParams]) -> None:
 SENSOR_SHAPES = {name: _shape_of(name, kind) for name, kind in SENSOR_PARAMS.items()}
 """Shapes by the names of the sensors. Compiled code depends on these, not on other parameters."""
 
-__all__ = [params.__name__ for params in AID_PARAMS.values()]  # what `quad_gym` exports
+__all__ = [params.__name__ for params in SENSOR_PARAMS.values()]  # what `quad_gym` exports

@@ -61,6 +61,7 @@ from quad_gym.params.sensor_table import (
     SENSOR_PARAMS,
     SensorParams,
     SensorTable,
+    in_words,
 )
 from quad_gym.params.uwb_range import UwbRangeParams
 from quad_gym.records import ALLOWED_TOGETHER, FEATURE_BLOCKS, MAX_UNDER_WAY, Aid
@@ -74,7 +75,6 @@ from quad_gym.records import ALLOWED_TOGETHER, FEATURE_BLOCKS, MAX_UNDER_WAY, Ai
 # --------------------------------------------------------------------------------------------------
 
 Delay = Annotated[float, check.between(-2.0, 2.0)]
-_WORDS = {"gnss": "GNSS"}  #: sensors in messages, where the name of the field is none
 
 
 class InitialPoseParams(Checked):
@@ -216,31 +216,36 @@ class SensorSuite(SensorTable, Saved):
     @property
     def heading_aid(self) -> Aid | None:
         """Aiding sensor that initializes the heading where no baseline does; None: none."""
-        alone = self.gnss is not None and not self.gnss.has_baseline
-        return Aid["MAGNETOMETER"] if alone and self.magnetometer is not None else None
+        if self.gives("gnss_baseline"):
+            return None
+        return next((aid for aid, params in self.aids.items() if params.shows_heading), None)
 
     @property
     def flow_alone(self) -> bool:
         """True if the filter keeps the heading unobservable: flow, but no positions."""
-        places = any("position" in params.observes for params in self.aids.values())
-        measures_in_I = places or self.gnss is not None or self.camera is not None
+        measured = (reading for name, reading in READINGS.items() if self.blocks_of(name))
+        places = any("position" in reading.observes for reading in measured)
         corrected = self.estimator.attitude_reset  # not the report's form
-        return corrected and self.optical_flow is not None and not measures_in_I
+        return corrected and self.optical_flow is not None and not places
 
     @property
     def drifts(self) -> bool:
-        """True if GNSS positions have a time-correlated error, which the filter estimates."""
-        return self.gnss is not None and self.gnss.drifts
+        """True if positions have a time-correlated error, which the filter estimates."""
+        return any(sensor.drift for sensor in self.sensors.values())
+
+    def drift_after(self, time: float) -> tuple[float, ...]:
+        """Return the standard deviations of this error a time [s] after it was zero [m]."""
+        return tuple(s for sensor in self.sensors.values() for s in sensor.drift_after(time))
 
     @property
-    def heading_errs(self) -> bool:
-        """True if baselines have a constant error, which the filter models as white noise."""
-        return self.gnss is not None and self.gnss.heading_errs
+    def counted_as_noise(self) -> tuple[str, ...]:
+        """Readings with a constant error that the filter models as white noise."""
+        return tuple(name for sensor in self.sensors.values() for name in sensor.counted_as_noise)
 
     def require_filter(self) -> None:
         """Refuse a suite whose filter misinterprets the IMU samples, or would overflow."""
-        if self.gnss is not None:
-            self.gnss.require_filter()
+        for sensor in self.sensors.values():
+            sensor.require_filter()
         if self.imu.samples == "average" and self.estimator.integration == "euler":
             raise ValueError(
                 "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="
@@ -276,7 +281,7 @@ class SensorSuite(SensorTable, Saved):
         """Rates, phases and measured quantities of the sensors."""
         found: dict[str, object] = {}
         for name, sensor in self.sensors.items():
-            word = _WORDS.get(name, name)
+            word = in_words(name).removeprefix("a ")
             found |= {f"{word} rate [Hz]": sensor.rate, f"{word} phase": sensor.phase}
             for reading in sensor.readings(name):
                 count = self.blocks_of(reading.name)
@@ -298,8 +303,8 @@ class SensorSuite(SensorTable, Saved):
         rates = {name: rate for name, rate in sensors.items() if rate is not None}
         for name, rate in rates.items():
             if getattr(self, name) is None:
-                lacking = _WORDS.get(name, f"a {name}")
-                raise ValueError(f"{name}_rate must not be given without {lacking}, got {rate} Hz")
+                lacking = f"{name}_rate must not be given without {in_words(name)}"
+                raise ValueError(f"{lacking}, got {rate} Hz")
         changed = {}
         for name, sensor in self.sensors.items():
             follows = sensor.rate == self.imu.rate or imu_rate < sensor.rate

@@ -44,7 +44,7 @@ class UwbRangeParams(AidParams):
     _ideal: ClassVar = {"latency": 0.0, "outlier_probability": 0.0}
     most_blocks, rows, observes = MOST_ANCHORS, 2 + MOST_ANCHORS, ("position", "height", "velocity")
     reads_velocity = False
-    unit, frame, meaning = "m", "-", "distances to the anchors"
+    words, unit, frame, meaning = "ranges to anchors", "m", "-", "distances to the anchors"
     raw = ("m", "-", 100.0)
 
     @property

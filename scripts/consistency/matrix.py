@@ -50,7 +50,7 @@ def case_of(
     elif wrong:
         expected = {"": wrong}
     else:
-        if flown.gnss is not None and flown.gnss.heading_errs:
+        if flown.counted_as_noise:
             expected["nis_baseline"] = "counts constant heading errors as noise"
         if flown.imu.accel_error_noise > 0.0 and (task == "waypoints" or "world" in keywords):
             reason = "counts errors of scale as noise"
