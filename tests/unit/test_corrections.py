@@ -52,7 +52,7 @@ def test_corrections_of_biases_and_drift_add_up_and_fade():
 
 @pytest.mark.parametrize("first", [0, 3])
 def test_filter_without_a_gate_is_flagged_while_its_biases_drift(first):
-    """Its sums are beyond 24, chi-square of three axes. No state changes, and the sums stay.
+    """The sums are beyond 24, chi-square of three axes. No state changes, and the sums stay.
 
     The flag stays for the time in which corrections reduce the error of a bias to a third: its
     variance over the rate at which updates have reduced it in the last 3 s, or the rate of its

@@ -17,12 +17,20 @@ UNKNOWN = math.pi / math.sqrt(3.0)
 
 def started(baseline, heading, arm=(0.2, -0.1, 0.3), ahead=(0.0, 0.0, 0.0), **estimator):
     """Filters of a level vehicle with this heading, which start from its first fix."""
-    suite = MAGNETIC.replace(magnetometer=None, barometer=None)
+    suite = MAGNETIC.replace(magnetometer=None)
     secondary = tuple(np.add(arm, baseline))
     gnss = suite.gnss.replace(primary_antenna_B=arm, secondary_antenna_B=secondary)
     suite = suite.replace(gnss=gnss, estimator=suite.estimator.replace(**estimator))
     rules, R_BI = LaneRules(suite), euler_to_dcm([0.0, 0.0, heading])
-    rules.set(P=np.tril(np.ones((15, 15))), r_hat=9.0, v_hat=9.0, b_a_hat=9.0, b_g_hat=9.0)
+    rules.set(
+        P=np.tril(np.ones((15, 15))),
+        P_slow=1.0,
+        slow_hat=9.0,
+        r_hat=9.0,
+        v_hat=9.0,
+        b_a_hat=9.0,
+        b_g_hat=9.0,
+    )
     rules.measured(POSITION_BLOCK, (PLACE + R_BI.T @ arm) @ R_IG)
     rules.measured(BASELINE_BLOCK, (R_BI.T @ np.array(baseline)) @ R_IG)
     rules.settings["heading_sensor"] = -1
@@ -45,6 +53,7 @@ def test_level_start_has_the_heading_of_the_baseline_and_its_covariance(heading,
     gnss, estimator, imu = suite.gnss, suite.estimator, suite.imu
     np.testing.assert_allclose(rules.get("R_hat")[0], R_BI, atol=1e-12)
     np.testing.assert_allclose(rules.get("r_hat")[0], PLACE, atol=1e-12)
+    np.testing.assert_array_equal(rules.get("slow_hat")[:, :3], 0.0)
     for name in ("v_hat", "b_a_hat", "b_g_hat"):
         np.testing.assert_array_equal(rules.get(name), 0.0)
     first = float(rules.params["first_baseline_sigma"][0, 0])
@@ -60,7 +69,11 @@ def test_level_start_has_the_heading_of_the_baseline_and_its_covariance(heading,
     P[:3, 6:9] = J @ P[6:9, 6:9]
     P[6:9, :3] = P[:3, 6:9].T
     P[:3, :3] = scale * np.diag(np.square(gnss.position_sigma_I)) + J @ P[6:9, 6:9] @ J.T
-    np.testing.assert_allclose(rules.covariance()[0], P, rtol=1e-9, atol=1e-15)
+    found = rules.covariance()[0]
+    np.testing.assert_allclose(found[:15, :15], P, rtol=1e-9, atol=1e-15)
+    # the error of the barometer, and two states that fill a block
+    slow = np.diag([suite.barometer.bias_sigma**2, 1.0, 1.0])
+    np.testing.assert_allclose(found[15:], np.hstack([np.zeros((3, 15)), slow]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("known", [True, False])
