@@ -8,7 +8,7 @@ import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import SensorLoss
-from quad_gym.records import AID_BLOCKS, Aid
+from quad_gym.records import AID_BLOCK, AID_BLOCKS, Aid
 from tests.field_flights import attitudes, fly, steps
 
 LAB = quad_gym.sensor_suite("standard").replace(camera=None)
@@ -79,6 +79,24 @@ def test_a_magnetometer_measures_the_field_with_its_errors():
     steps(batch, 0.1)
     np.testing.assert_array_equal(batch.record("aid_vector")[:, MAGNETOMETER], hard_iron)
     np.testing.assert_array_equal(batch.record("aid_scalar")[:, MAGNETOMETER], declination)
+
+
+def test_measurements_are_zero_beyond_their_own_numbers():
+    """A range or an altitude has one of three, a flow two: others would count as innovations."""
+    suite = quad_gym.sensor_suite("uwb").replace(
+        barometer=BarometerParams(rate=100.0),
+        range_finder=quad_gym.RangeFinderParams(rate=100.0),
+        optical_flow=quad_gym.OpticalFlowParams(rate=100.0),
+    )
+    batch = fly(suite, 8, task="hover", start="hover")
+    steps(batch, 0.1)
+    values, fresh = batch.record("measurement"), batch.record("block_fresh")
+    for aid, length in (("BAROMETER", 1), ("RANGE_FINDER", 1), ("UWB_RANGE", 1),
+                        ("OPTICAL_FLOW", 2)):  # fmt: skip
+        block = AID_BLOCK[Aid[aid]]
+        assert fresh[:, block].any()
+        assert values[:, block, :length].any()
+        assert not values[:, block, length:].any()
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.5, None])
