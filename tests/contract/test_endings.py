@@ -7,6 +7,8 @@ import pytest
 import quad_gym
 from quad_gym import Cylinder, GroundParams, WorldParams
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import WIDTH, Ending
+from tests.builders import batch as flights_of
 
 CRASHES = {
     "out of bounds": ("Hover", {"action": "velocity"}, (1.0, 0.0, 0.0, 0.0)),
@@ -124,3 +126,41 @@ def test_task_with_own_endings_accepts_start_out_of_bounds():
     env = QuadVectorEnv(2, base="hover", task=Patient)
     env.reset(seed=1, options={"position": (-2.0, 0.0, 1.0)})
     assert not env.step(np.zeros((2, 4)))[2].any()
+
+
+def fallen(k, flights, **values):
+    """Set fields of flight k of a snapshot."""
+    for name, value in values.items():
+        flights[name][k // WIDTH, ..., k % WIDTH] = value
+
+
+@pytest.mark.parametrize("truncates", [False, True])
+def test_each_ending_has_its_cause_and_the_worst_one_is_named(truncates):
+    """A filter that is flagged as diverged ends an episode only if the task says so."""
+    task = quad_gym.TaskParams(
+        start="hover", max_tilt=1.0, out_of_bounds=3.0, min_height=0.5,
+        truncate_when_diverged=truncates,
+    )  # fmt: skip
+    batch = flights_of(8, task=task, sensors="rtk")
+    batch.step()
+    flights, x = batch.snapshot(), batch.record("r")
+    far, low = np.array([8.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.45])
+    diverged = {"alarm_tick": 1e9, "diverged": 1.0}
+    tipped = {"q": np.array([np.cos(0.55), np.sin(0.55), 0.0, 0.0])}
+    fallen(1, flights, **diverged)
+    fallen(2, flights, **diverged, filter_status=1)
+    fallen(3, flights, r=np.append(x[3, :2], low[2]), **diverged, filter_status=1)
+    fallen(4, flights, r=np.append(x[4, :2], low[2]), **tipped, **diverged)
+    fallen(5, flights, r=x[5] + far, **tipped, filter_status=1)
+    fallen(6, flights, q=np.array([np.cos(0.45), np.sin(0.45), 0.0, 0.0]))
+    fallen(7, flights, r=np.append(x[7, :2], 0.55))
+    batch.restore(flights)
+    batch.step()
+    expected = ["NONE", "FILTER_DIVERGED", "FILTER_FAILED", "BELOW_MIN_HEIGHT", "TIPPED_OVER",
+                "OUT_OF_BOUNDS", "NONE", "NONE"]  # fmt: skip
+    if not truncates:
+        expected[1] = "NONE"
+    assert [Ending(int(k)).name for k in batch.result("ending")] == expected
+    np.testing.assert_array_equal(batch.result("terminated"), [0, 0, 0, 1, 1, 1, 0, 0])
+    truncated = np.array([0, truncates, 1, 1, truncates, 1, 0, 0])
+    np.testing.assert_array_equal(batch.result("truncated"), truncated)
