@@ -26,6 +26,7 @@ from quad_gym.kernels.stages import STAGE_TABLE, Stage
 from quad_gym.params import checks as check
 from quad_gym.records import (
     FLIGHT_BLOCK,
+    PRECISION,
     RESULTS,
     SHOWN,
     SHOWN_SIZE,
@@ -38,47 +39,56 @@ from quad_gym.records import (
     Room,
     aligned_zeros,
     offset_of,
-    require_double,
 )
-from quad_gym.records.sizes import RESIDENT
+from quad_gym.records.sizes import REAL, RESIDENT
 from quad_gym.tasks.batch import TaskBatch
 
 with contextlib.suppress(ImportError):  # plans and PTX for wheels need no torch
     import torch
+
+    _KINDS = {"f8": torch.float64, "f4": torch.float32, "u8": torch.int64}
 
 # --------------------------------------------------------------------------------------------------
 # `DevicePlan`: a configuration for a GPU, flown where only NumPy and torch are needed.
 # --------------------------------------------------------------------------------------------------
 
 Words = NDArray[np.uint64]
+Parts = NDArray[np.uint32]
 
 
 class FieldPlace(NamedTuple):
     """Place of a field in the record of a flight."""
 
-    first: int  #: index of its first word
+    first: int  #: its first byte
     shape: tuple[int, ...]
-    kind: str  #: "f8", "i8" or "u8"
+    kind: str  #: "f8", "f4" in single precision, or "u8"
+
+    @property
+    def bytes(self) -> slice:
+        """Bytes of the field in the record of a flight."""
+        size = int(np.prod(self.shape)) * np.dtype(self.kind).itemsize
+        return slice(self.first, self.first + size)
 
 
 class DevicePlan(NamedTuple):
-    """A configuration; words have eight bytes, and a record has the words of one flight."""
+    """A configuration; a record has the numbers of one flight, in parts of four bytes."""
 
     settings: bytes
     stages: Mapping[Stage, str]
-    flight: Words  #: record of a flight that has never been reset
-    skipped: int  #: words of the full record before the first stored one
+    flight: Parts  #: record of a flight that has never been reset
+    skipped: int  #: bytes of the full record before the first stored one
     fields: Mapping[str, FieldPlace]
-    world: Words  #: record of the true parameters
-    model: Words  #: record of the parameters that filter and controller assume
+    world: Parts  #: record of the true parameters
+    model: Parts  #: record of the parameters that filter and controller assume
     paths: NDArray[np.uint8]  #: a task's trajectories
     pieces: NDArray[np.uint8]  #: their segments
     low: NDArray[np.float64]  #: bounds of an observation, (k,)
     high: NDArray[np.float64]
-    work: int  #: words of the workspace of a flight
+    work: int  #: bytes of the workspace of a flight
     results: tuple[str, ...]  #: names of the results of a step
     autoreset: int  #: an `Autoreset`
     shown: int = 0  #: numbers of a flight for the views of a task in Python
+    real: str = "f8"  #: kind of the numbers in records
 
 
 # --------------------------------------------------------------------------------------------------
@@ -139,6 +149,11 @@ class CudaLauncher:
 # --------------------------------------------------------------------------------------------------
 
 
+ALIGNED = 4 * WARP
+"""Bytes of a number of all flights of a block in single precision, of which the addresses of blocks
+are multiples (`kernels/numbers/blocks.py`)."""
+
+
 class Launcher(Protocol):
     """Flies the blocks of a call."""
 
@@ -168,7 +183,7 @@ class DeviceBatch:
         self._launch, size = launcher, plan.low.size
         blocks = -(-count // WARP)
         warps = min(launcher.warps, blocks)
-        self._blocks = self._repeated(plan.flight, blocks)
+        self._blocks = self._repeated(plan.flight, plan.fields.values(), blocks)
         self._seen = [self._zeros(count, size, kind=torch.float32) for _ in range(2)]
         self.final_observations = torch.zeros_like(self._seen[0])
         """(n, k) float32, written where one episode ends and the next begins in a step"""
@@ -182,11 +197,11 @@ class DeviceBatch:
         self._memory = {
             Call.BLOCKS: self._blocks,
             Call.RESETS: self._resets,
-            Call.WORLD: self._repeated(plan.world, 1),
-            Call.OWN: self._repeated(plan.world, warps),
-            Call.MODEL: self._repeated(plan.model, 1),
-            Call.BELIEVED: self._repeated(plan.model, warps),
-            Call.WORK: self._zeros(warps, plan.work, WARP),
+            Call.WORLD: self._parameters(plan.world, 1),
+            Call.OWN: self._parameters(plan.world, warps),
+            Call.MODEL: self._parameters(plan.model, 1),
+            Call.BELIEVED: self._parameters(plan.model, warps),
+            Call.WORK: self._block_memory(warps, plan.work).zero_(),
             Call.STAGES: self._put(table.view(np.int64)),
             Call.ACTIONS: self._actions,
             Call.LOW: self._put(plan.low),
@@ -198,8 +213,8 @@ class DeviceBatch:
         words = np.zeros(len(Call), np.int64)
         for word, tensor in self._memory.items():
             words[word] = tensor.data_ptr()
-        words[Call.BLOCKS] -= 8 * WARP * plan.skipped
-        words[Call.PITCH] = 8 * WARP * len(plan.flight)
+        words[Call.BLOCKS] -= WARP * plan.skipped
+        words[Call.PITCH] = self._blocks.shape[1]
         words[Call.COUNT], words[Call.SIZE] = count, size
         words[Call.AUTORESET] = plan.autoreset
         words[Call.RESULT_PITCH] = words[Call.SHOWN_PITCH] = 8 * self._results.shape[1]
@@ -256,9 +271,12 @@ class DeviceBatch:
         return {name: self.result(f"reward_{name}") for name in builtin}
 
     def record(self, name: str) -> torch.Tensor:
-        """Return a copy of a field of all flights by its name in the kernels, (n, ...)."""
-        field = self._field(name)
-        return field.movedim(-1, 1).flatten(0, 1)[: self.count].clone()
+        """Return a copy of a field of all flights by its name in the kernels, (n, ...).
+
+        Numbers of single precision are returned as float64.
+        """
+        found = self._field(name).movedim(-1, 1).flatten(0, 1)[: self.count]
+        return found.double() if found.dtype == torch.float32 else found.clone()
 
     def write(self, name: str, values: torch.Tensor) -> None:
         """Write a field of all flights, (n, ...)."""
@@ -272,9 +290,9 @@ class DeviceBatch:
     def _field(self, name: str) -> torch.Tensor:
         """Return a view of a field, (blocks, ..., WARP)."""
         field = self.plan.fields[name]
-        part = self._blocks[:, field.first : field.first + int(np.prod(field.shape))]
-        part = part.view(torch.float64) if field.kind == "f8" else part
-        return part.unflatten(1, field.shape) if field.shape else part[:, 0]
+        first, end, _ = field.bytes.indices(self._blocks.shape[1])
+        part = self._blocks[:, WARP * first : WARP * end].view(_KINDS[field.kind])
+        return part.unflatten(1, (*field.shape, WARP))
 
     def _put(self, array: Any) -> torch.Tensor:
         return torch.from_numpy(np.array(array)).to(self.device)
@@ -282,10 +300,28 @@ class DeviceBatch:
     def _zeros(self, *shape: int, kind: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(shape, dtype=kind or torch.float64, device=self.device)
 
-    def _repeated(self, words: Words, times: int) -> torch.Tensor:
-        """Return a record for all flights of so many blocks, (times, words, WARP)."""
-        one = self._put(words.view(np.int64))
-        return one[:, None].expand(times, -1, WARP).contiguous()
+    def _block_memory(self, count: int, size: int) -> torch.Tensor:
+        """Return memory for blocks of flights with so many bytes each, (count, WARP size)."""
+        whole = count * WARP * size
+        memory = torch.empty(whole + ALIGNED, dtype=torch.uint8, device=self.device)
+        first = -memory.data_ptr() % ALIGNED
+        return memory[first : first + whole].view(count, WARP * size)
+
+    def _repeated(self, record: Parts, fields: Iterable[FieldPlace], count: int) -> torch.Tensor:
+        """Return so many blocks in which all flights have the same record, as bytes."""
+        given = record.view(np.uint8)
+        one = np.empty(WARP * given.size, np.uint8)
+        for field in fields:
+            values = given[field.bytes].view(field.kind)
+            first, end, _ = field.bytes.indices(given.size)
+            one[WARP * first : WARP * end] = np.repeat(values, WARP).view(np.uint8)
+        return self._block_memory(count, given.size).copy_(self._put(one))
+
+    def _parameters(self, record: Parts, count: int) -> torch.Tensor:
+        """Return so many blocks with the same parameters, which are numbers without words."""
+        kind = np.dtype(self.plan.real)
+        whole = FieldPlace(0, (record.nbytes // kind.itemsize,), self.plan.real)
+        return self._repeated(record, [whole], count)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -395,7 +431,8 @@ class _TaskOnHost(TaskBatch):
     def _fetched(self, name: str, flights: NDArray[np.intp] | None) -> NDArray[Any]:
         values = self._flights.record(name)
         values = values if flights is None else values[self._flights._put(flights)]
-        return _array(values).view(FLIGHT_BLOCK[name].base)
+        found, kind = _array(values), FLIGHT_BLOCK[name].base
+        return found.view(kind) if kind.kind == "u" else found
 
     def _drawn(self, columns: slice) -> NDArray[np.float64]:
         return _array(self._flights.record("drawn")[:, columns])
@@ -434,10 +471,8 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
     """Return the plan of a batch that has never been reset, for any number of flights.
 
     Raises:
-        ValueError: If the batch needs Python during its steps, other than the methods of a task,
-            or the process computes in single precision.
+        ValueError: If the batch needs Python during its steps, other than the methods of a task.
     """
-    require_double("a flight on a GPU")
     c = batch.configuration
     for python, what in (
         (c.estimator is not None, "an own estimator"),
@@ -445,18 +480,18 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
     ):
         if python:
             raise ValueError(f"flights on a GPU need compiled steps, and {what} runs in Python")
-    room, line = batch._room, 8 * WIDTH
+    room = batch._room
     fields = {}
     for name in room.dtype.names or ():
         kind = room.dtype[name]
-        first = offset_of(room.dtype, name) // line
+        first = offset_of(room.dtype, name) // WIDTH
         fields[name] = FieldPlace(first, kind.shape[:-1], kind.base.str[1:])
     paths, pieces = (np.frombuffer(array.tobytes(), np.uint8) for array in batch._paths)
     return DevicePlan(
         settings=batch._settings.tobytes(),
         stages=batch._stages,
-        flight=batch.copied_record(0).view(np.uint64),
-        skipped=room.skipped // line,
+        flight=batch.copied_record(0),
+        skipped=room.skipped // WIDTH,
         fields=fields,
         world=_first_lane(batch._world),
         model=_first_lane(batch._model),
@@ -464,15 +499,16 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
         pieces=pieces,
         low=batch._low,
         high=batch._high,
-        work=WORK_BLOCK.itemsize // line,
+        work=WORK_BLOCK.itemsize // WIDTH,
         results=RESULTS,
         autoreset=int(c.compiled_autoreset),
         shown=SHOWN_SIZE if batch._settings["shown"][0] else 0,
+        real=REAL,
     )
 
 
-def _first_lane(block: NDArray[Any]) -> Words:
-    return block.view(np.uint64).reshape(-1, WIDTH)[:, 0].copy()
+def _first_lane(block: NDArray[Any]) -> Parts:
+    return block.view(REAL).reshape(-1, WIDTH)[:, 0].copy().view(np.uint32)
 
 
 def ptx_of(plan: DevicePlan) -> bytes:
@@ -504,7 +540,7 @@ def pack(plans: Iterable[DevicePlan]) -> Iterator[Path]:
 
 def _packed(plan: DevicePlan) -> Path:
     """Return the file of a wheel with the PTX of a plan, which need not exist."""
-    key = repr((plan.settings, sorted(plan.stages.items())))
+    key = repr((plan.settings, sorted(plan.stages.items()), PRECISION))
     sources = sources_digest(Path(__file__).parent)
     return FOLDER / f"{sources[:12]}_{hashlib.sha256(key.encode()).hexdigest()[:12]}.ptx.z"
 

@@ -132,10 +132,7 @@ def _write_results(call, flight, work, index):
     store_lanes(here + Result.FILTER_DIVERGED * pitch, flight.diverged)
     for k in range(_TERMS):
         store_lanes(here + (_FIRST_TERM + k) * pitch, work.reward_term[k])
-    block = _plain_flight_at(block_address(call, index))
-    status = _floats_at(here + Result.FILTER_STATUS * pitch, WIDTH)
-    for lane in range(REGISTER):
-        status[lane] = block.filter_status[lane]
+    store_lanes(here + Result.FILTER_STATUS * pitch, flight.filter_status)
 
 
 @kernel

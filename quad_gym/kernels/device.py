@@ -2,8 +2,8 @@
 
 The flights of a block are next to each other in memory, so that the threads of a warp, which fly
 them, read and write consecutive numbers. The numbers of a flight are 8 bytes behind those of the
-flight before it: with addresses shifted by that, the code is the code of the batch, with one flight
-in a register.
+flight before it, in single precision 4: with addresses shifted by that, the code is the code of the
+batch, with one flight in a register.
 """
 
 from llvmlite import ir
@@ -21,6 +21,7 @@ from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
+    REAL_BYTES,
     SETTINGS,
     WIDTH,
     WORK_BLOCK,
@@ -118,14 +119,14 @@ def fly_one(call_at, index, lane, worker, command):
     call = _copied(_words_at(call_at, _CALL_WORDS))
     if index * WIDTH + lane >= call[Call.COUNT]:
         return
-    shift = 8 * lane
+    shift, row = REAL_BYTES * lane, 8 * lane  # of numbers in blocks, and of what Python reads
     call[Call.LANE] = lane
     # once: of a sum in both branches of the command, ptxas stores one on a wrong condition
     call[Call.BLOCKS] = _held(block_address(call, index) + shift)
     call[Call.PITCH] = 0
-    call[Call.RESULTS] += shift
-    call[Call.SHOWN] += shift
-    call[Call.ACTIONS] += 4 * shift
+    call[Call.RESULTS] += row
+    call[Call.SHOWN] += row
+    call[Call.ACTIONS] += 4 * row
     call[Call.WORK] += worker * _WORK_SIZE + shift
     call[Call.OWN] += worker * _PARAMS_SIZE + shift
     call[Call.BELIEVED] += worker * _PARAMS_SIZE + shift

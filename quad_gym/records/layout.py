@@ -92,9 +92,9 @@ def room_of(used: frozenset[str]) -> Room:
 
 
 def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
-    """Return `count` zeroed records that begin on a cache line."""
-    raw = np.zeros(count * dtype.itemsize + 64, np.uint8)
-    start = -raw.ctypes.data % 64
+    """Return `count` zeroed records that begin on a cache line, as blocks of a GPU on two."""
+    raw = np.zeros(count * dtype.itemsize + 128, np.uint8)
+    start = -raw.ctypes.data % 128
     return raw[start : start + count * dtype.itemsize].view(dtype)
 
 

@@ -71,7 +71,7 @@ def lanes_of_machine() -> int:
     """
     wanted = os.environ.get("QUAD_GYM_LANES")
     if wanted:
-        if wanted not in map(str, SINGLE_WIDTHS if SINGLE else (*WIDTHS, WARP)):
+        if wanted not in map(str, (*(SINGLE_WIDTHS if SINGLE else WIDTHS), WARP)):
             known = "2, 4, 8 or 16 in single precision" if SINGLE else "2, 4 or 8"
             raise ValueError(f"QUAD_GYM_LANES must be {known}, got {wanted!r}")
         return int(wanted)

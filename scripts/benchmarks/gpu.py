@@ -8,7 +8,8 @@ The first part emits a module for each golden case that a GPU can fly, which tak
 hour on two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and
 cuda-core. Both skip the results in FOLDER: if one was interrupted or ran out of time, run it again.
 With `--only TEXT`, they select cases and measurements by a part of their names. Results are
-in FOLDER/results.json.
+in FOLDER/results.json. With `QUAD_GYM_PRECISION=single` and another FOLDER, all three parts are for
+flights in single precision.
 """
 
 import argparse

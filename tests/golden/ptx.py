@@ -21,6 +21,8 @@ typedef uint64_t u64; typedef int64_t s64; typedef uint32_t u32; typedef int32_t
 typedef uint16_t u16; typedef int16_t s16; typedef uint8_t u8;
 static inline double D(u64 x) { double d; memcpy(&d, &x, 8); return d; }
 static inline u64 U(double d) { u64 x; memcpy(&x, &d, 8); return x; }
+static inline float F(u32 x) { float f; memcpy(&f, &x, 4); return f; }
+static inline u32 V(float f) { u32 x; memcpy(&x, &f, 4); return x; }
 #define ACCESS(n) \\
   static inline u64 ld##n(u64 a) { u##n x; memcpy(&x, (void *)a, n / 8); return x; } \\
   static inline void st##n(u64 a, u##n x) { memcpy((void *)a, &x, n / 8); }
@@ -29,9 +31,10 @@ static inline double larger(double a, double b) { return a != a ? b : b != b ? a
   a == b ? (signbit(a) ? b : a) : a > b ? a : b; }
 static inline double smaller(double a, double b) { return a != a ? b : b != b ? a :
   a == b ? (signbit(a) ? a : b) : a < b ? a : b; }
-static inline u32 single(double d) { float f = d; u32 x; memcpy(&x, &f, 4); return x; }
 static inline s64 whole(double d) { return d != d ? INT64_MIN :
   d >= 0x1p63 ? INT64_MAX : d < -0x1p63 ? INT64_MIN : (s64)d; }
+static inline s32 whole32(double d) { return d != d ? 0 :
+  d >= 0x1p31 ? INT32_MAX : d < -0x1p31 ? INT32_MIN : (s32)d; }
 static inline u32 funnel(u32 low, u32 high, u32 by) { by &= 31;
   return by ? high << by | low >> (32 - by) : high; }
 static u32 tid, ctaid, ntid = 32, nctaid = 1;
@@ -45,18 +48,46 @@ OPTIONS = ("-O1", "-w", "-fPIC", "-ffp-contract=off", "-fno-strict-aliasing", "-
 SPECIAL = {"%tid.x": "tid", "%ctaid.x": "ctaid", "%ntid.x": "ntid", "%nctaid.x": "nctaid"}
 ORDERS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^"}
-KINDS = {"pred": "int", "b16": "u16", "b32": "u32", "b64": "u64"}
+KINDS = {"pred": "int", "b16": "u16", "b32": "u32", "b64": "u64", "f32": "u32", "f64": "u64"}
+BOTH = {  # of a kind of floats: N reads one from a register, and B writes one
+    "fma.rn": "B(C_fma(N({1}), N({2}), N({3})))",
+    "sqrt.rn": "B(C_sqrt(N({1})))",
+    "rcp.rn": "B(1 / N({1}))",
+    "max": "B(larger(N({1}), N({2})))",
+    "min": "B(smaller(N({1}), N({2})))",
+    **{
+        f"{name}.rn": f"B(N({{1}}) {sign} N({{2}}))"
+        for name, sign in (("add", "+"), ("sub", "-"), ("mul", "*"), ("div", "/"))
+    },
+}
+
+
+def _of_kind(kind, read, write, suffix):
+    """Return the instructions of a kind of floats by their names."""
+    words = {r"\bN\(": f"{read}(", r"\bB\(": f"{write}(", r"\bC_(\w+)": rf"\1{suffix}"}
+    found = {}
+    for name, text in BOTH.items():
+        for old, new in words.items():
+            text = re.sub(old, new, text)
+        found[f"{name}.{kind}"] = text
+    return found
+
+
 FLOATS = {
-    "fma.rn.f64": "U(fma(D({1}), D({2}), D({3})))",
-    "sqrt.rn.f64": "U(sqrt(D({1})))",
-    "rcp.rn.f64": "U(1.0 / D({1}))",
+    **_of_kind("f64", "D", "U", ""),
+    **_of_kind("f32", "F", "V", "f"),
     "neg.f64": "{1} ^ 1ULL << 63",
     "abs.f64": "{1} & ~(1ULL << 63)",
-    "max.f64": "U(larger(D({1}), D({2})))",
-    "min.f64": "U(smaller(D({1}), D({2})))",
+    "neg.f32": "{1} ^ 1U << 31",
+    "abs.f32": "{1} & ~(1U << 31)",
     "cvt.rni.f64.f64": "U(rint(D({1})))",
-    "cvt.rn.f32.f64": "single(D({1}))",
+    "cvt.rni.f32.f32": "V(rintf(F({1})))",
+    "cvt.rn.f32.f64": "V(D({1}))",
+    "cvt.f64.f32": "U(F({1}))",
     "cvt.rzi.s64.f64": "whole(D({1}))",
+    "cvt.rzi.s64.f32": "whole(F({1}))",
+    "cvt.rzi.s32.f64": "whole32(D({1}))",
+    "cvt.rzi.s32.f32": "whole32(F({1}))",
     "shf.l.wrap.b32": "funnel({1}, {2}, {3})",
     "mul.hi.u64": "(unsigned __int128)(u64){1} * (u64){2} >> 64",
     "mul.hi.s64": "(__int128)(s64){1} * (s64){2} >> 64",
@@ -181,10 +212,9 @@ def _value(name, a, places):
         return FLOATS[name].format(*x)
     if base in ("cvta", "mov"):
         return x[1]
-    if re.fullmatch(r"(add|sub|mul|div)\.rn\.f64", name):
-        return f"U(D({x[1]}) {SIGNS[base]} D({x[2]}))"
-    if found := re.fullmatch(r"cvt\.rn\.f64\.([su]\d+)", name):
-        return f"U((double)({found.group(1)}){x[1]})"
+    if found := re.fullmatch(r"cvt\.rn\.f(32|64)\.([su]\d+)", name):
+        kind = {"32": "V((float)", "64": "U((double)"}[found.group(1)]
+        return f"{kind}({found.group(2)}){x[1]})"
     if found := re.fullmatch(r"cvt\.([us]\d+)\.([us]\d+)", name):
         return f"({found.group(1)})({found.group(2)}){x[1]}"
     if base == "setp":
@@ -213,10 +243,11 @@ def _value(name, a, places):
 
 
 def _comparison(order, kind, x):
-    if kind != "f64":
+    if kind not in ("f32", "f64"):
         plain = kind.replace("b", "u")
         return f"({plain}){x[1]} {ORDERS[order]} ({plain}){x[2]}"
-    left, right = f"D({x[1]})", f"D({x[2]})"
+    read = {"f32": "F", "f64": "D"}[kind]
+    left, right = f"{read}({x[1]})", f"{read}({x[2]})"
     unordered = f"isunordered({left}, {right})"
     if order in ("num", "nan"):
         return f"{'!' if order == 'num' else ''}{unordered}"
@@ -227,9 +258,9 @@ def _comparison(order, kind, x):
 
 def _operand(text, places):
     text = text.strip()
-    if found := re.fullmatch(r"%(rd|rs|r|p)(\d+)", text):
+    if found := re.fullmatch(r"%(rd|rs|r|p|f|fd)(\d+)", text):
         return f"{found.group(1)}[{found.group(2)}]"
-    if text.startswith("0d"):
+    if re.match("0[df]", text):
         return f"0x{text[2:]}ULL"
     if text in ("%SP", "%SPL"):
         return text[1:]

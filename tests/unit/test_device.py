@@ -1,5 +1,6 @@
 """Flights on a GPU: device code on this processor flies as the batch does."""
 
+import os
 import re
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine
 from quad_gym.kernels.sources import sources_digest
 from quad_gym.params.suites import SUITES
-from tests.builders import vec_env
+from tests.builders import run_python, vec_env
 from tests.golden import device, ptx, sass
 from tests.golden.flights import trajectories
 
@@ -32,6 +33,7 @@ from tests.contract.test_torch_env import (  # noqa: E402
 
 COUNT = 40  # a block, and a part of one
 TRUTH = {"observation": "truth", "max_episode_steps": 25, "max_tilt": 0.6}
+SINGLE = {"QUAD_GYM_PRECISION": "single"}
 pytestmark = pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for this processor")
 
 
@@ -60,6 +62,21 @@ def episodes_of(base, mode, launcher=device.launcher_of, **keywords):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_flights_of_device_code_equal_those_of_the_batch(mode):
     assert episodes_of("circle", mode, **TRUTH) > COUNT
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        "test_flights_of_ptx_equal_those_of_the_batch",
+        pytest.param("equal_those_of_the_batch and not ptx and not gpu", marks=pytest.mark.slow),
+        pytest.param("test_filtered_flights_of_ptx", marks=pytest.mark.slow),
+    ],
+)
+def test_flights_of_device_code_in_single_precision_equal_those_of_the_batch(chosen):
+    words = ("-m", "pytest", "-q", "-n", "0", "-m", "slow or not slow", "-k")
+    done = run_python(*words, f"({chosen}) and not single_precision", __file__, **SINGLE)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " passed" in done.stdout
 
 
 def test_flights_of_ptx_equal_those_of_the_batch():
@@ -169,7 +186,7 @@ def test_module_in_a_wheel_is_taken_for_its_sources_and_settings_alone(tmp_path,
         (TRUTH, 200, 250e3),
         pytest.param({}, 500, 900e3, marks=pytest.mark.slow),
         pytest.param(
-            {"sensors": "rtk", "faults": "gnss_outage"}, 500, 1400e3, marks=pytest.mark.slow
+            {"sensors": "rtk", "faults": "gnss_outage"}, 500, 1600e3, marks=pytest.mark.slow
         ),
     ],
 )
@@ -296,9 +313,10 @@ def test_missing_gpu_is_named():
 
 @pytest.mark.slow  # compiles all kernels
 @pytest.mark.parametrize("kind", [[], ["--modules", "Circle, standard", "many options"]])
-def test_golden_flights_are_the_same_by_device_code(kind):
-    command = [sys.executable, "-m", "tests.golden.device", *kind]
-    assert subprocess.run(command, cwd=device.ROOT, check=False).returncode == 0
+@pytest.mark.parametrize("variables", [{}, SINGLE], ids=["double", "single"])
+def test_golden_flights_are_the_same_by_device_code(kind, variables):
+    command, env = [sys.executable, "-m", "tests.golden.device", *kind], os.environ | variables
+    assert subprocess.run(command, cwd=device.ROOT, env=env, check=False).returncode == 0
 
 
 @pytest.mark.slow  # compiles all kernels

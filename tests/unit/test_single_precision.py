@@ -102,8 +102,8 @@ def test_each_number_in_a_block_belongs_to_one_lane():
     [
         ({"QUAD_GYM_PRECISION": "half"}, "must be double or single, got 'half'"),
         (
-            {"QUAD_GYM_PRECISION": "single", "QUAD_GYM_LANES": "32"},
-            "must be 2, 4, 8 or 16 in single precision, got '32'",
+            {"QUAD_GYM_PRECISION": "single", "QUAD_GYM_LANES": "64"},
+            "must be 2, 4, 8 or 16 in single precision, got '64'",
         ),
     ],
 )

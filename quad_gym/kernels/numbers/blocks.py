@@ -100,7 +100,13 @@ class _LaneRecordAttributes(AttributeTemplate):
 def _field_pointer(
     builder: ir.IRBuilder, block: LaneRecord, pointer: Any, name: str, kind: Any
 ) -> Any:
-    offset = ir.Constant(ir.IntType(64), block.record.offset(name))
+    word = ir.IntType(64)
+    offset: Any = ir.Constant(word, block.record.offset(name))
+    if kind == words and REGISTER < WIDTH and REAL_BYTES < 8:
+        # the address of one flight of a block is that of the block, a multiple of REAL_BYTES
+        # WIDTH, and that of the flight's lane among numbers; its words have twice the distance
+        lane = ir.Constant(word, REAL_BYTES * WIDTH - 1)
+        offset = builder.add(builder.and_(builder.ptrtoint(pointer, word), lane), offset)
     return builder.bitcast(builder.gep(pointer, [offset]), kind.llvm_type.as_pointer())
 
 
@@ -319,18 +325,20 @@ def array_at(dtype: Any) -> Any:
 
 @intrinsic
 def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
-    """Write lanes to consecutive float64 at an address, whatever the precision of lanes."""
-    if value != lanes:
+    """Write lanes or words to consecutive float64 at an address, whatever the precision."""
+    if value not in (lanes, words):
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value, wide = args[1], ir.VectorType(ir.DoubleType(), REGISTER)
-        if value.type != wide:
-            value = builder.fpext(value, wide)
-        builder.store(value, builder.inttoptr(args[0], wide.as_pointer()), align=8)
+        number, wide = args[1], ir.VectorType(ir.DoubleType(), REGISTER)
+        if value == words:
+            number = builder.uitofp(number, wide)
+        elif number.type != wide:
+            number = builder.fpext(number, wide)
+        builder.store(number, builder.inttoptr(args[0], wide.as_pointer()), align=8)
         return context.get_dummy_value()
 
-    return types.none(types.int64, lanes), lower
+    return types.none(types.int64, value), lower
 
 
 def _lane_pointer(builder: ir.IRBuilder, addresses: Any, offset: Any, lane: int) -> Any:
