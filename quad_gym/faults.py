@@ -278,7 +278,7 @@ class WrongAssociations(Fault):
     def check_suite(self, sensors: SensorSuite) -> None:
         """Refuse a suite without a camera, or with a single feature."""
         super().check_suite(sensors)
-        if sensors.camera is not None and len(sensors.camera.features_I) < 2:
+        if sensors.blocks_of("pixels") < 2:
             raise ValueError(
                 "faults must concern sensors of the suite: WrongAssociations needs a camera with "
                 "at least two features"

@@ -21,8 +21,9 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.packing import params_record
 from quad_gym.params import checks as check
+from quad_gym.params.sensor_table import READINGS, SENSOR_OF
 from quad_gym.params.trajectories import Trajectory
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, Source
+from quad_gym.records import BLOCKS_OF, Source
 from quad_gym.rotations import quaternion_to_dcm
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ class Column(NamedTuple):
 
 FEATURES = -1
 
+FIXES = tuple(name for name in READINGS if SENSOR_OF[name] == "gnss")
+"""Readings with a decision in `gnss_decision`, in its order."""
+
 # fmt: off
 _ROWS: tuple[str | Column, ...] = (
     "time",
@@ -62,7 +66,7 @@ _ROWS: tuple[str | Column, ...] = (
     # the state that the controller observed
     "observed_position", "observed_quaternion",
     # the latest measurements since the previous row
-    "gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity",
+    "gyro", "accel", *FIXES,
     Column("gnss_decision", (3,), "-", "-", "gate decisions on position, baseline and velocity, see `GateDecision`; 0: no gate"),
     "pixels",
     Column("feature_decision", (FEATURES,), "-", "-", "gate decision on each feature, see `GateDecision`"),
@@ -373,7 +377,7 @@ def table(rows: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
 def _parts(column: Column, count: int) -> Sequence[str]:
     """Return the suffixes of a column's names in a table, one per number."""
     if column.name == "gnss_decision":
-        return "position", "baseline", "velocity"
+        return [READINGS[name].label for name in FIXES]
     if column.name in ("action", "rotor_speeds", "feature_decision"):
         return [str(k + 1) for k in range(count)]
     return "wxyz" if column.name.endswith("quaternion") else "xyz"
@@ -474,9 +478,7 @@ class FlightRecorder:
         flight = check.whole("flight", flight, least=0, most=batch.count - 1)
         self._batch, self._which = batch, np.array([flight])
         self._about = dict(about or {})
-        camera = batch.sensors.camera
-        features = 0 if camera is None else len(camera.features_I)
-        self._rows = np.zeros(256, row_dtype(features))
+        self._rows = np.zeros(256, row_dtype(batch.sensors.blocks_of("pixels")))
         self._count = 0
         self._copies: list[NDArray[np.uint32]] = []
         """instants not yet converted to rows: a copy takes a hundredth of the time of a row"""
@@ -591,11 +593,11 @@ def _fill(rows: NDArray[Any], batch: FlightBatch, scene: FlightScene) -> None:
     gate = batch.record("gate")
     rows["covariance"] = batch.covariance()
     rows["nees"] = _nees(rows, batch.record("R_hat"), rotation_vector=batch.sensors.flow_alone)
-    for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
+    for k, name in enumerate(FIXES):
         measured = ~np.isnan(rows[name]).all(axis=1)
-        rows["gnss_decision"][:, block] = np.where(measured, gate[:, block], np.nan)
+        rows["gnss_decision"][:, k] = np.where(measured, gate[:, BLOCKS_OF[name].start], np.nan)
     seen = np.isfinite(rows["pixels"]).all(axis=2)
-    decisions = gate[:, FEATURE_BLOCKS:AID_BLOCKS][:, : seen.shape[1]]
+    decisions = gate[:, BLOCKS_OF["pixels"]][:, : seen.shape[1]]
     rows["feature_decision"] = np.where(seen, decisions, np.nan)
 
 

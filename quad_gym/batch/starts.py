@@ -481,22 +481,21 @@ MAX_START_TILT = 0.15
 No sensor measures the tilt of a start: the accelerometer of a vehicle that hovers measures its
 thrust, which is along the body z axis at any tilt."""
 
-MAX_BASELINE_SIGMA = 0.15  #: standard deviation of the heading from the first baseline [rad]
+MAX_BASELINE_SIGMA = 0.15
+"""Standard deviation of the heading from a first measurement whose errors average out [rad]."""
 MAX_HEADING_SIGMA = 0.1
-"""Standard deviation of the heading of a mark, or due to hard iron, with GNSS or flow [rad]."""
+"""Standard deviation of the heading of a mark, or due to an error that lasts [rad]."""
 MAX_HEADING_SIGMA_INDOORS = 1.0
-"""The same with a camera and without GNSS: images correct it in steps [rad]."""
+"""The same with images and without fixes: images correct it in steps [rad]."""
 MAX_POSITION_SIGMA = 1.0
-"""Standard deviation of the position of a mark without GNSS, with features 8 m away [m]."""
-
-STEEP = 0.2
-"""Level share of a baseline that is too steep for a heading; as in `kernels/filter/starts.py`."""
+"""Standard deviation of the position of a mark without fixes, with features 8 m away [m]."""
 
 
 def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
     """Refuse tilts from which a filter cannot start, and warn of too uncertain starts."""
-    magnetometer = sensors.magnetometer if sensors.heading_aid is not None else None
-    slope = 0.0 if magnetometer is None else abs(math.tan(magnetometer.inclination))
+    source = sensors.heading_source
+    heading = None if source is None else source.first_heading
+    slope = 0.0 if heading is None else heading.slope
     most = MAX_START_TILT / max(slope, 1.0)
     for name in ("start_roll", "start_pitch"):
         if name not in draws.names:
@@ -523,24 +522,18 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
 
 def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
     """Fields that exceed their bounds: name, value, bound and unit."""
-    gnss, magnetometer, pose = sensors.gnss, sensors.magnetometer, sensors.initial_pose
-    share, bounds = 0.0, []  # level share of the baseline of a level vehicle
-    if gnss is not None and gnss.has_baseline:
-        x, y, z = gnss.baseline_B
-        share = math.hypot(x, y) / math.hypot(x, y, z)
-    if gnss is not None and share >= STEEP:
-        most = MAX_BASELINE_SIGMA * share
-        bounds.append(("GnssParams.baseline_sigma", gnss.baseline_sigma, most, "rad"))
-    elif sensors.heading_aid is not None and magnetometer is not None:
-        most = MAX_HEADING_SIGMA * math.hypot(*magnetometer.field_I[:2])
-        iron = magnetometer.hard_iron_sigma
-        bounds.append(("MagnetometerParams.hard_iron_sigma", iron, most, "T"))
+    pose, source, bounds = sensors.initial_pose, sensors.heading_source, []
+    fixes = sensors.blocks_of("gnss_position") > 0
+    heading = None if source is None else source.first_heading
+    if heading is not None:
+        most = MAX_HEADING_SIGMA if heading.lasting else MAX_BASELINE_SIGMA
+        name = f"{type(source).__name__}.{heading.field}"
+        bounds.append((name, heading.sigma, most * heading.per_radian, heading.unit))
     else:
-        most = MAX_HEADING_SIGMA
-        if gnss is None and sensors.camera is not None:
-            most = MAX_HEADING_SIGMA_INDOORS
+        images = not fixes and sensors.blocks_of("pixels") > 0
+        most = MAX_HEADING_SIGMA_INDOORS if images else MAX_HEADING_SIGMA
         bounds.append(("InitialPoseParams.heading_sigma", pose.heading_sigma, most, "rad"))
-    if gnss is None:
+    if not fixes:
         sigma = pose.position_sigma
         bounds.append(("InitialPoseParams.position_sigma", sigma, MAX_POSITION_SIGMA, "m"))
     return ((name, value, most, unit) for name, value, most, unit in bounds if value > most)

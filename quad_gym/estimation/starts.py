@@ -20,6 +20,7 @@ from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
 from quad_gym.packing import follows_motion, slow_states
 from quad_gym.params import checks as check
+from quad_gym.params.gnss import STEEP
 from quad_gym.params.portable import turned
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import BASELINE_BLOCK, POSITION_BLOCK, START, Aid, lower_factors, shown_rows
@@ -62,10 +63,6 @@ MAX_MOTION = 0.1
 the effect of the bias of a cheap accelerometer."""
 
 STEEPEST_NOSE = 0.05  #: horizontal fraction of the x axis below which its heading is undefined
-
-STEEP = 0.2
-"""Horizontal fraction of a baseline, 12 degrees from the vertical, below which it does not observe
-the heading; as in `kernels/filter/starts.py`."""
 
 _D = 15  #: the first time-correlated error among the states
 

@@ -32,6 +32,17 @@ class SlowError(NamedTuple):
         return portable.exp(-time / self.tau), drive
 
 
+class FirstHeading(NamedTuple):
+    """Noise of a sensor that gives the heading with which a filter starts."""
+
+    field: str  #: of the parameters, such as "baseline_sigma"
+    sigma: float
+    unit: str
+    per_radian: float  #: noise that turns the heading by one radian, in the unit
+    lasting: bool  #: True for an error that does not change from one measurement to the next
+    slope: float = 0.0  #: error of the heading due to an unknown tilt, over that tilt
+
+
 class ReadingDefinition(NamedTuple):
     """What a sensor measures: one block of numbers, or several of one kind.
 
@@ -135,6 +146,11 @@ class SensorBase(Checked):
     def drift_after(self, time: float) -> tuple[float, ...]:
         """Return the standard deviations of `drift` a time [s] after it was zero."""
         return ()
+
+    @property
+    def first_heading(self) -> FirstHeading | None:
+        """Noise of the heading with which a filter starts; None: it does not show the heading."""
+        return None
 
     @property
     def counted_as_noise(self) -> tuple[str, ...]:

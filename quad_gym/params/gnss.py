@@ -8,11 +8,15 @@ import numpy as np
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import MIN_DRIFT, ReadingDefinition, SensorBase, SlowError
+from quad_gym.params.aids import MIN_DRIFT, FirstHeading, ReadingDefinition, SensorBase, SlowError
 
 HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
 
+
+STEEP = 0.2
+"""Level share of a baseline below which it does not show the heading, 12 degrees from the vertical;
+as in `kernels/filter/starts.py`."""
 
 MIN_BASELINE = 1e-3  #: antennas are farther apart than this [m]
 
@@ -162,6 +166,17 @@ class GnssParams(SensorBase):
         if self.secondary_antenna_B is None:
             raise ValueError("GnssParams.secondary_antenna_B must be given for a baseline")
         return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
+
+    @property
+    def first_heading(self) -> FirstHeading | None:
+        """Noise of the baseline; None: with one antenna, or a baseline that is too steep."""
+        if not self.has_baseline:
+            return None
+        x, y, z = self.baseline_B
+        share = math.hypot(x, y) / math.hypot(x, y, z)
+        if share < STEEP:
+            return None
+        return FirstHeading("baseline_sigma", self.baseline_sigma, "rad", share, lasting=False)
 
     @property
     def drifts(self) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import AidParams, SlowError
+from quad_gym.params.aids import AidParams, FirstHeading, SlowError
 
 MICROTESLA = 1e-6  #: one microtesla [T]
 
@@ -64,6 +64,13 @@ class MagnetometerParams(AidParams):
             level * portable.cos(self.declination),
             -self.strength * portable.sin(self.inclination),
         )
+
+    @property
+    def first_heading(self) -> FirstHeading:
+        """Hard iron, which turns the heading by its ratio to the level field."""
+        level, slope = math.hypot(*self.field_I[:2]), abs(math.tan(self.inclination))
+        iron = self.hard_iron_sigma
+        return FirstHeading("hard_iron_sigma", iron, "T", level, lasting=True, slope=slope)
 
     @property
     def slow_vector(self) -> SlowError:

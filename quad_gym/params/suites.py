@@ -221,6 +221,15 @@ class SensorSuite(SensorTable, Saved):
         return next((aid for aid, params in self.aids.items() if params.shows_heading), None)
 
     @property
+    def heading_source(self) -> SensorParams | None:
+        """Sensor that gives the heading of a filter's start; None: the mark of the start does."""
+        aid = self.heading_aid
+        if aid is not None:
+            return self.aids[aid]
+        others = (s for s in self.sensors.values() if not isinstance(s, AidParams))
+        return next((sensor for sensor in others if sensor.first_heading is not None), None)
+
+    @property
     def flow_alone(self) -> bool:
         """True if the filter keeps the heading unobservable: flow, but no positions."""
         measured = (reading for name, reading in READINGS.items() if self.blocks_of(name))

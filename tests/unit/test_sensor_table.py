@@ -18,6 +18,7 @@ from quad_gym.params.sensor_table import AID_PARAMS, READINGS, SENSOR_OF, _shape
 from quad_gym.records import PARAMS
 
 UWB = quad_gym.sensor_suite("uwb")
+LACKING_ALL = UWB.replace(uwb_range=None)
 COMPLETE = {"observes": ("height",), "unit": "m", "frame": "-", "meaning": "depth"}
 COMPLETE |= {"raw": ("m", "-", 10.0)}
 
@@ -36,6 +37,21 @@ def test_class_of_a_sensor_that_is_wrong_is_refused_by_its_member(change, messag
     with pytest.raises(ValueError, match=message):
         _shape_of("depth", type("Depth", (AidParams,), members))
     assert _shape_of("depth", type("Depth", (AidParams,), COMPLETE)).readings[0].length == 1
+
+
+@pytest.mark.parametrize(
+    ("sensor", "words"),
+    [
+        ("gnss", "GNSS"),
+        ("camera", "a camera"),
+        ("optical_flow", "optical flow"),
+        ("range_finder", "a range finder"),
+        ("uwb_range", "ranges to anchors"),
+    ],
+)
+def test_sensor_that_a_suite_lacks_is_named_in_words(sensor, words):
+    with pytest.raises(ValueError, match=f"{sensor}_rate must not be given without {words}, got"):
+        LACKING_ALL.with_rates(**{sensor: 10.0})
 
 
 def test_numbers_beyond_the_rows_of_a_sensor_are_refused(monkeypatch):
