@@ -345,16 +345,11 @@ def slow_errors_of(sensors: SensorSuite) -> list[SlowError]:
 
 def _pack_mark(p: Any, sensors: SensorSuite) -> None:
     """Write what the mark of the start gives, as if it had been measured."""
-    pose, fixed = sensors.initial_pose, sensors.blocks_of("gnss_position") > 0
-    if not fixed:  # the antenna is at the center, the baseline along the x axis
-        p["R_IG"], p["position_sigma_I"] = np.eye(3), pose.position_sigma
-    if not sensors.blocks_of("gnss_baseline"):
-        # with positions a vertical one, which does not observe the heading either
-        p["baseline"] = (0.0, 0.0, 1.0) if fixed else (1.0, 0.0, 0.0)
-        p["baseline_length"] = 1.0
-        for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
-            p[name] = pose.heading_sigma
-    p["secondary_antenna_B"] = p["antenna"] + p["baseline"]
+    pose = sensors.initial_pose
+    for name, kind in SENSOR_PARAMS.items():
+        sensor = getattr(sensors, name)
+        for field, value in kind.from_mark(sensor, pose.position_sigma, pose.heading_sigma).items():
+            p[field] = value
 
 
 def _pack_filter(p: Any, sensors: SensorSuite) -> None:

@@ -165,6 +165,22 @@ class SensorBase(Checked):
         """Numbers for the kernels, by fields of their parameters; others are in `numbers`."""
         return {}
 
+    @classmethod
+    def from_mark(
+        cls, sensor: Self | None, position_sigma: float, heading_sigma: float
+    ) -> dict[str, Any]:
+        """Return numbers with which the mark of a start stands for readings that are not measured.
+
+        Args:
+            sensor: Parameters of the suite's sensor; None: it has none.
+            position_sigma: Standard deviation of the position of the mark, per axis [m].
+            heading_sigma: Standard deviation of the heading of the mark [rad].
+
+        Returns:
+            As `packed`, which they replace.
+        """
+        return {}
+
     @property
     def options(self) -> dict[str, bool]:
         """Errors and limits of the true sensor, by fields of the kernels' settings."""

@@ -1,7 +1,7 @@
 """GNSS: positions, velocities, the baseline between two antennas, and their errors."""
 
 import math
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
@@ -214,9 +214,35 @@ class GnssParams(SensorBase):
         }
         if self.has_baseline:
             found["baseline"] = self.baseline_B
+            found["secondary_antenna_B"] = np.array(self.primary_antenna_B) + self.baseline_B
             found["baseline_length"] = portable.norm(self.baseline_B)
             found["first_baseline_sigma"] = self.first_baseline_sigma
             found["baseline_noise"] = self.baseline_noise
+        return found
+
+    @classmethod
+    def from_mark(
+        cls, sensor: Self | None, position_sigma: float, heading_sigma: float
+    ) -> dict[str, Any]:
+        """Return an antenna at the center of mass, and a baseline, where they are not measured.
+
+        The baseline is along the x axis or, where positions are measured, vertical, so that it does
+        not show the heading.
+        """
+        if sensor is not None and sensor.has_baseline:
+            return {}
+        baseline = np.array((1.0, 0.0, 0.0) if sensor is None else (0.0, 0.0, 1.0))
+        antenna = np.zeros(3) if sensor is None else np.array(sensor.primary_antenna_B)
+        found: dict[str, Any] = {
+            "baseline": baseline,
+            "baseline_length": 1.0,
+            "secondary_antenna_B": antenna + baseline,
+            "baseline_sigma": heading_sigma,
+            "first_baseline_sigma": heading_sigma,
+            "baseline_noise": heading_sigma,
+        }
+        if sensor is None:
+            found |= {"R_IG": np.eye(3), "position_sigma_I": (position_sigma,) * 3}
         return found
 
     @property
