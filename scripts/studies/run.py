@@ -131,9 +131,10 @@ def write_tables(parts: Sequence[Part], root: Path, *, partial: bool) -> list[Pa
     """Write the rows of tables into docs/data.
 
     Args:
-        parts: Parts to write.
-        root: Folder of the rows.
-        partial: True: also the rows of incomplete parts.
+        parts: Parts whose tables are written, with the rows of all parts of these.
+        root: Folder of the rows, into which those of docs/data were taken over.
+        partial: True: also the rows of incomplete parts; False: of these only the rows that
+            docs/data has already.
     """
     written = []
     for table in dict.fromkeys(part.table for part in parts):
@@ -144,7 +145,9 @@ def write_tables(parts: Sequence[Part], root: Path, *, partial: bool) -> list[Pa
             continue
         complete = [part for part in own if is_complete(part, rows)]
         if not partial:
-            rows = tables(cells_of(complete, root)).get(table)
+            known = {row_key(row) for row in Rows.read(DATA / f"{table}.csv").rows}
+            kept = [cell for cell in cells if cell.part in complete or cell.key in known]
+            rows = tables(kept).get(table)
         if rows is not None:
             with FileLock(root / "tables.lock"):  # two processes may complete a part at once
                 rows.write(DATA / f"{table}.csv")
@@ -212,7 +215,8 @@ def main(args: RunArgs) -> int:
     with options.usage_errors():
         parts = chosen_parts(args)
         options.require_at_least(args, jobs=1, seeds=1, cells=1)
-    take_over(cells_of(parts, args.output))
+    written = {part.table for part in parts}  # whole, even if some of their parts are chosen
+    take_over(cells_of([part for part in PARTS if part.table in written], args.output))
     if args.list:
         print(report(parts, args.output, args.seeds))
         return 0

@@ -289,3 +289,19 @@ def test_parts_are_chosen_by_words_of_their_names(small, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         run.main(dataclasses.replace(small, list=True, parts=("unknown",)))
     assert "--parts must have words of a part" in capsys.readouterr().err
+
+
+def test_rows_of_other_parts_of_a_table_stay_when_chosen_parts_are_complete(small, monkeypatch):
+    second = dataclasses.replace(
+        SMALL, decides="something else", arms=("std_certainty",), steps=32_768
+    )
+    monkeypatch.setattr(run, "PARTS", (SMALL, second))
+    assert run.main(dataclasses.replace(small, cells=2, parts=("it works",))) == 0
+    assert run.main(dataclasses.replace(small, write=True)) == 0  # the rows so far
+    known = Rows.read(run.DATA / "small.csv").rows
+    assert len(known) == 2
+    elsewhere = small.output / "elsewhere"  # as on another machine
+    assert run.main(dataclasses.replace(small, output=elsewhere, parts=("else",))) == 0
+    rows = Rows.read(run.DATA / "small.csv").rows
+    assert [row for row in rows if row in known] == known
+    assert len(rows) == 2 + 2
