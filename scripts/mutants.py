@@ -91,7 +91,7 @@ _FAST = {
 }
 """Settings with which kernels compile fast; the bits of flights do not depend on them."""
 _WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
-_FIRST, _MOST = 10, 60
+_FIRST, _MOST = 10, 120
 """Number of tests that run first, and of all that run."""
 _WORDS_OF = "QUAD_GYM_MUTANT"  #: variable with the words of the mutant, for pytest's process
 _OPERATORS: dict[type[ast.AST], str] = {
