@@ -41,7 +41,10 @@ class LookAround(Task):
 
         0.1 exp(-e) + 0.1 exp(-5 e) + 0.15 h - 2 (crashed)
 
-    At most 0.35 per step, so 262.5 in an episode of 750 steps.
+    At most 0.35 per step, so 262.5 in an episode of 750 steps. Neither of two simple rules gets
+    it: PD control that tracks the desired heading loses its position in two thirds of the
+    episodes, and PD control that faces the wall forgoes the reward for the heading. The page "Your
+    own task" changes this reward.
 
     ## Observation
     The built-in observation, followed by `features_direction` (3): the unit vector from the
@@ -50,9 +53,6 @@ class LookAround(Task):
     ## Endings
     The endings of `QuadEnv`, with a bound of 8 m on the distance from the reference, so that a
     controller with a wrong position estimate has time to recover. The minimum height is -5 m.
-
-    These two rules fail: PD control that tracks the desired heading loses its position in two
-    thirds of the episodes, and PD control that faces the wall forgoes the reward for the heading.
 
     Args:
         heading_weight: Weight of h in the reward.
