@@ -84,8 +84,9 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 test-clients:  ## each client of docs/libraries.md in an environment of its own; CLIENTS="torchrl minari": these
 	$(PYTHON) tests/clients/run.py $(CLIENTS)
 
-test-arm: setup  ## golden flights on AArch64, emulated: needs gcc-aarch64-linux-gnu and qemu-user-static
+test-arm: setup  ## golden flights on AArch64, emulated, in both precisions: needs gcc-aarch64-linux-gnu and qemu-user-static
 	$(BIN)/python -m tests.golden.aarch64
+	QUAD_GYM_PRECISION=single $(BIN)/python -m tests.golden.aarch64
 
 test-single: setup  ## golden flights and exported filters in single precision, with each number of lanes
 	for lanes in 16 8 4 2; do QUAD_GYM_PRECISION=single QUAD_GYM_LANES=$$lanes \

@@ -2,10 +2,10 @@
 
 python -m tests.golden.aarch64 [CASE ...]    # needs aarch64-linux-gnu-gcc and qemu-aarch64-static
 
-Python flies the cases here, with two lanes and the library of compiled kernels, and records the
-memory before and after the calls. A C program (`replay.c`), linked with the kernels for AArch64,
-makes the same calls on a copy of this memory; then both must be equal. Only the bits of NaNs may
-differ, as they depend on the processor.
+Python flies the cases here, with two lanes and the library of compiled kernels, in single precision
+with four lanes and Numba, and records the memory before and after the calls. A C program
+(`replay.c`), linked with the kernels for AArch64, makes the same calls on a copy of this memory;
+then both must be equal. Only the bits of NaNs may differ, as they depend on the processor.
 """
 
 import itertools
@@ -20,7 +20,14 @@ from typing import Any
 
 import numpy as np
 
-LANES, COMPILER, EMULATOR = 2, "aarch64-linux-gnu-gcc", "qemu-aarch64-static"
+from quad_gym.kernels.compiling import building
+from quad_gym.records.sizes import REAL_BYTES, SINGLE
+
+COMPILER, EMULATOR = "aarch64-linux-gnu-gcc", "qemu-aarch64-static"
+LANES = 16 // REAL_BYTES  #: numbers in a register
+KERNELS = "numba" if SINGLE else "library"  #: of the flights here
+PROCESSOR = building.PROCESSORS["aarch64"][2]
+NUMBERS, WORDS = (np.float32, np.uint32) if SINGLE else (np.float64, np.uint64)
 PLACE = 1 << 36  #: address of the memory in the C program
 LINE = 64  #: size of the pieces in which changed memory is sent [bytes]
 SHOWN_EVERY = 30  #: calls between comparisons; the last call is compared, too
@@ -117,8 +124,8 @@ class Recording:
         expected = np.concatenate([memory[: self._memory.compared] for memory in shown])
         if len(found) != len(expected):
             return f"{len(found)} bytes, not {len(expected)}"
-        a, b = expected.view(np.float64), np.frombuffer(found, np.float64)
-        other = (a.view(np.uint64) != b.view(np.uint64)) & ~(np.isnan(a) & np.isnan(b))
+        a, b = expected.view(NUMBERS), np.frombuffer(found, NUMBERS)
+        other = (a.view(WORDS) != b.view(WORDS)) & ~(np.isnan(a) & np.isnan(b))
         return f"{other.sum()} of {len(a)} words differ" if other.any() else ""
 
 
@@ -128,12 +135,11 @@ def _words(*numbers: int) -> bytes:
 
 def _program(folder: Path) -> tuple[Path, dict[str, int]]:
     """Return the C program with all kernels for AArch64, and the order of its stages."""
-    from quad_gym.kernels.compiling import building
     from quad_gym.kernels.library import core_symbol
     from quad_gym.kernels.stages import SOURCES
 
     names = building.part_names()
-    objects = building.objects_of(names, building.PROCESSORS["aarch64"][LANES])
+    objects = building.objects_of(names, PROCESSOR)
     for k, content in enumerate(objects):
         (folder / f"{k}.o").write_bytes(content)
     stages = list(dict.fromkeys(source.name for source in SOURCES))
@@ -185,7 +191,7 @@ def _compare(chosen: list[str]) -> None:
 
 
 def main() -> None:
-    """Check the tools, build the library for Python, and compare in a separate process."""
+    """Check the tools, make the kernels for Python, and compare in a separate process."""
     missing = [tool for tool in (COMPILER, EMULATOR, "cc") if shutil.which(tool) is None]
     if missing:
         print(
@@ -193,11 +199,10 @@ def main() -> None:
             "apt install gcc gcc-aarch64-linux-gnu qemu-user-static"
         )
         return
-    if os.environ.get("QUAD_GYM_KERNELS") != "library":
-        from quad_gym.kernels.compiling import building
-
-        building.build([LANES])
-        choice = {"QUAD_GYM_KERNELS": "library", "QUAD_GYM_LANES": str(LANES)}
+    if os.environ.get("QUAD_GYM_KERNELS") != KERNELS:
+        if KERNELS == "library":
+            building.build([LANES])
+        choice = {"QUAD_GYM_KERNELS": KERNELS, "QUAD_GYM_LANES": str(LANES)}
         generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
         command = [sys.executable, "-m", "tests.golden.aarch64", *sys.argv[1:]]
         done = subprocess.run(command, cwd=ROOT, env=os.environ | generic | choice, check=False)
