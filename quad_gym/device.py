@@ -64,10 +64,9 @@ class FieldPlace(NamedTuple):
     kind: str  #: "f8", "f4" in single precision, or "u8"
 
     @property
-    def bytes(self) -> slice:
-        """Bytes of the field in the record of a flight."""
-        size = int(np.prod(self.shape)) * np.dtype(self.kind).itemsize
-        return slice(self.first, self.first + size)
+    def end(self) -> int:
+        """The byte behind it."""
+        return self.first + int(np.prod(self.shape)) * np.dtype(self.kind).itemsize
 
 
 class DevicePlan(NamedTuple):
@@ -290,8 +289,7 @@ class DeviceBatch:
     def _field(self, name: str) -> torch.Tensor:
         """Return a view of a field, (blocks, ..., WARP)."""
         field = self.plan.fields[name]
-        first, end, _ = field.bytes.indices(self._blocks.shape[1])
-        part = self._blocks[:, WARP * first : WARP * end].view(_KINDS[field.kind])
+        part = self._blocks[:, WARP * field.first : WARP * field.end].view(_KINDS[field.kind])
         return part.unflatten(1, (*field.shape, WARP))
 
     def _put(self, array: Any) -> torch.Tensor:
@@ -312,9 +310,8 @@ class DeviceBatch:
         given = record.view(np.uint8)
         one = np.empty(WARP * given.size, np.uint8)
         for field in fields:
-            values = given[field.bytes].view(field.kind)
-            first, end, _ = field.bytes.indices(given.size)
-            one[WARP * first : WARP * end] = np.repeat(values, WARP).view(np.uint8)
+            values = given[field.first : field.end].view(field.kind)
+            one[WARP * field.first : WARP * field.end] = np.repeat(values, WARP).view(np.uint8)
         return self._block_memory(count, given.size).copy_(self._put(one))
 
     def _parameters(self, record: Parts, count: int) -> torch.Tensor:

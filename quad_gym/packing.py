@@ -128,7 +128,7 @@ class SlowStates(NamedTuple):
     """slow errors, padded to a multiple of three by constants with standard deviation one"""
     estimated: int  #: number of slow errors without the padding
     drifts: bool
-    """True if the first three are the drift of positions, which is zero at the start"""
+    """True if the first three are the drift of GNSS positions, which is zero at the start"""
     vectors: tuple[int, ...]
     """index of the first of an aiding sensor's three errors, in the order of `Aid`; -1: none"""
     scalars: tuple[int, ...]
@@ -217,10 +217,10 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
 
 
 def follows_motion(sensors: SensorSuite) -> int:
-    """Return 1 if a suite's filter compares its heading with the motion, by measured velocities.
+    """Return 1 if a suite's filter compares its heading with the motion, by GNSS velocities.
 
-    With directions, which show the heading better, it is 2: the motion only shows a heading that is
-    unknown. Without velocities or a gate it is 0.
+    With a baseline or a camera, which measure the heading better, it is 2: the motion only shows a
+    heading that is unknown. Without GNSS velocities or a gate it is 0.
     """
     if not sensors.blocks_of("gnss_velocity"):
         return 0

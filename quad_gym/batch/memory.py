@@ -197,7 +197,7 @@ class FlightMemory:
         return found
 
     def feature_places(self) -> NDArray[np.float64]:
-        """Return the features of images as the filter assumes them, (count, m, 3) in I [m]."""
+        """Return the features of the camera as the filter assumes them, (count, m, 3) in I [m]."""
         count = self.sensors.blocks_of("pixels")
         if self._room.holds("feature_place"):
             return np.ascontiguousarray(self.record("feature_place")[:, :count])

@@ -286,7 +286,7 @@ class Measurements:
 
     @cached_property
     def features(self) -> Floats:
-        """Features of images on the map, (n, features, 3) in I [m]."""
+        """Features of the camera on the map, (n, features, 3) in I [m]."""
         return self._batch.feature_places()
 
     # ---- readings -----------------------------------------------------------------------------

@@ -227,7 +227,7 @@ QUANTITIES = {
     "position_error": Quantity("position_error", (), "m", "-", "distance of the true position from the reference"),
     "estimation_error": Quantity("estimation_error", (), "m", "-", "distance of the observed from the true position"),
     # the surroundings
-    "features": Quantity(_features, ("features", 3), "m", "I", "features of images, in the filter's map of this episode"),
+    "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, in the filter's map of this episode"),
     "obstacles": Quantity(_first("obstacle_center", lambda b: len(b.world.obstacles)), ("obstacles", 3), "m", "I", "centers of the world's obstacles in this episode, in the order given"),
     "obstacle_distance": Quantity(_obstacle_distance, (), "m", "-", "from the nearest obstacle's surface, negative inside, infinite without obstacles"),
     "on_ground": Quantity("footing", (), "-", "-", "a foot touches the ground, in a world whose ground supports vehicles", bool),

@@ -482,13 +482,13 @@ No sensor measures the tilt of a start: the accelerometer of a vehicle that hove
 thrust, which is along the body z axis at any tilt."""
 
 MAX_BASELINE_SIGMA = 0.15
-"""Standard deviation of the heading from a first measurement whose errors average out [rad]."""
+"""Standard deviation of the heading from the first baseline, whose noise averages out [rad]."""
 MAX_HEADING_SIGMA = 0.1
-"""Standard deviation of the heading of a mark, or due to an error that lasts [rad]."""
+"""Standard deviation of the heading of a mark, or due to hard iron, which lasts [rad]."""
 MAX_HEADING_SIGMA_INDOORS = 1.0
-"""The same with images and without fixes: images correct it in steps [rad]."""
+"""The same with a camera and without GNSS: images correct it in steps [rad]."""
 MAX_POSITION_SIGMA = 1.0
-"""Standard deviation of the position of a mark without fixes, with features 8 m away [m]."""
+"""Standard deviation of the position of a mark without GNSS, with features 8 m away [m]."""
 
 
 def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:

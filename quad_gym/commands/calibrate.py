@@ -50,7 +50,7 @@ class CalibrateArgs(ReadingArgs):
     """heading of the body x axis at the start, from east toward north [deg], one for each log;
     by default from a baseline or a magnetometer"""
     course: bool = False
-    """use the direction of the first measured velocity as heading"""
+    """use the direction of the first GNSS velocity as heading"""
     vehicle: Path | None = None
     """write a vehicle (.toml) with thrust and rotor lag from the motor voltages in the logs to this
     file, and a world with its linear drag beside it (VEHICLE-world.toml)"""

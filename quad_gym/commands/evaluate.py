@@ -222,7 +222,7 @@ class EvaluateArgs:
     estimator: options.EstimatorName = None
     normalization: options.Normalized = None
     env: options.Keywords = field(default_factory=dict)
-    """further keywords of the environment, such as action=motor control_rate=100"""
+    """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
     """number of episodes of each policy on each observation"""
     seed: int = 0

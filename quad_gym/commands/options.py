@@ -310,7 +310,7 @@ Keywords = Annotated[
         str_from_instance=lambda value: [f"{k}={v}" for k, v in value.items()],
     ),
 ]
-"""Keywords given as `key=value` pairs, such as `--env observation=truth action=motor`."""
+"""Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
 
 Parameters = Annotated[
     Keywords, arg(help="parameters of the algorithm that override the recipe's, such as gamma=0.98")

@@ -130,8 +130,7 @@ class ReplayArgs(ReadingArgs):
     """initial position east, north and up [m], level and at rest, with --heading; required for logs
     without GNSS"""
     course: bool = False
-    """use the direction of the first measured velocity as heading, for vehicles that fly nose
-    first"""
+    """use the direction of the first GNSS velocity as heading, for vehicles that fly nose first"""
     window: float = 0.5
     """longest delay of measurements [s]"""
     reported_noise: bool = True

@@ -34,7 +34,7 @@ class TrainArgs:
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
     env: options.Keywords = field(default_factory=dict)
-    """keywords of the environment, such as observation=truth action=motor"""
+    """keywords of the environment, such as observation=truth action=motor camera=false"""
     steps: int | None = None
     """number of environment steps; defaults to the recipe's"""
     n_envs: int | None = None

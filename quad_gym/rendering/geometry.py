@@ -1,6 +1,6 @@
-"""Geometry of pictures in NumPy: a perspective view, ellipsoids, and visible faces.
+"""Geometry of pictures in NumPy: a viewing camera, ellipsoids, and visible faces.
 
-The axes of a view are x to the right, y down and z into the picture, in pixels from the
+A viewing camera's axes are x to the right, y down and z into the picture, in pixels from the
 picture's upper left corner.
 """
 
@@ -14,12 +14,12 @@ from quad_gym.flights import Flight
 from quad_gym.records import Shape
 
 # --------------------------------------------------------------------------------------------------
-# Geometry of pictures in NumPy: a perspective view, and outlines of ellipsoids.
+# Geometry of pictures in NumPy: a viewing camera, and outlines of ellipsoids.
 # --------------------------------------------------------------------------------------------------
 
 Floats = NDArray[np.float64]
 
-NEAR = 0.05  #: distance from the eye below which objects are not drawn [m]
+NEAR = 0.05  #: distance from the viewing camera below which objects are not drawn [m]
 AROUND = 6.0  #: distance from reference and start within which a fixed view shows obstacles [m]
 
 
@@ -218,7 +218,7 @@ def ellipsoid_outline(center: Floats, axes: Floats, view: Perspective, count: in
     """Outline of an ellipsoid with half-axes in rows, (count, 2) pixels; (0, 2) if it is too near.
 
     In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]], where A is the sum of the outer
-    products of its half-axes; the projection matrix maps it to the dual conic of its outline (R.
+    products of its half-axes; the camera matrix maps it to the dual conic of its outline (R.
     Hartley, A. Zisserman, Multiple View Geometry, 2003, section 8.3).
     """
     c = view.in_view(center)

@@ -207,7 +207,7 @@ class Uncertainty(Term):
 
 @dataclass(frozen=True)
 class Visibility(Term):
-    """Number of features in the field of view that no obstacle hides."""
+    """Number of features in the camera's field of view that no obstacle hides."""
 
     def __call__(self, view: "View") -> Floats:
         return view.truth.features_in_view.sum(axis=1).astype(np.float64)

@@ -9,11 +9,11 @@ Since `de = S(e) w` maps body rates to Euler rates and S(0) is the identity,
 so the covariance is transformed, too: P_e <- S^-1 P_e S^-T, and the correlations with e
 accordingly. The report leaves the covariance unchanged.
 
-With FIRST_ESTIMATES (optical flow, no sensor of the position) the heading is unobservable. The
-error e is then a rotation vector, R_BI = exp(-[e x]) R_hat, and keeps its direction in I when an
-update corrects the attitude; a correction dv of the velocity adds R_hat^T e x dv to the velocity's
-error in the next prediction, or the next step of a progressive update. So an update gives no
-information about a rotation about the vertical (docs/filter-equations.md, "Unobservable heading").
+With FIRST_ESTIMATES (optical flow, neither GNSS nor camera) the heading is unobservable. The error
+e is then a rotation vector, R_BI = exp(-[e x]) R_hat, and keeps its direction in I when an update
+corrects the attitude; a correction dv of the velocity adds R_hat^T e x dv to the velocity's error
+in the next prediction, or the next step of a progressive update. So an update gives no information
+about a rotation about the vertical (docs/filter-equations.md, "Unobservable heading").
 As only motions in B are measured,
 a heading error psi moves position and velocity in I along arcs: across them to first order, which P
 contains, and along their radii in proportion to psi^2, which no update may change. `arc` has the

@@ -320,7 +320,7 @@ def without_directions(flight, p, work, settings):
 
     From work.nu and work.Rz before whitening; uses work.M and work.y. Where the second order of
     the prior is small, the components along directions are independent. A heading alone is a
-    baseline with noise above pi along two axes.
+    baseline with noise above pi along two axes, see `gnss.py`.
     """
     k, numbers = 0, zero_like(work.spread)
     nis, wide = numbers, no_lane(numbers)
@@ -410,7 +410,7 @@ def _joint_nis(work, blocks):
 # explain the measurements:
 #
 # * the mean of NIS over its degrees of freedom;
-# * sums of the corrections of the IMU biases and of the drift of positions over some seconds,
+# * sums of the corrections of the IMU biases and of the drift of GNSS positions over some seconds,
 #   whose normalized squares are chi-square. They show a bias that has changed long before
 #   innovations do, as attitude and position may compensate each other, and a jump that the drift
 #   has absorbed.

@@ -1,4 +1,4 @@
-"""The heading by motion: from IMU and measured velocity alone, linear in a complex number.
+"""The heading by motion: from IMU and GNSS velocity alone, linear in a complex number.
 
 A second attitude W = R_BN follows the gyro. N is level, but its heading is unknown. With horizontal
 vectors as complex numbers (east + i north), u = exp(i psi) turns N to I. The velocity v in I, with
@@ -11,7 +11,7 @@ circular noise therefore needs no first heading. Between two fixes with the sums
 
     v <- v + A u + T d,   d <- k d,   k = exp(-T / tau),
 
-and its covariance P_xy = E[x conj(y)] follows likewise. A measured velocity z with the noise
+and its covariance P_xy = E[x conj(y)] follows likewise. A fix z of the GNSS velocity with the noise
 sigma_v per axis has
 
     nu = z - v,   S = P_vv + 2 sigma_v^2,
@@ -28,7 +28,7 @@ soon as u is known, and variances and limits are larger until then.
 N is leveled by the force that the change of velocity does not explain. Leveling by the whole force
 would follow a steady turn with a lag that looks like a heading. What leveling leaves is d.
 
-Where no measured direction shows the heading, too, three rules compare the filter with it:
+Where no baseline and no camera measures the heading, too, three rules compare the filter with it:
 
 * **Support.** Where the headings agree, the heading counts as measured: a refused compass stays
   out. Both turn with the gyro. If the fields have left the gate gradually, its bias may have
@@ -42,7 +42,7 @@ Where no measured direction shows the heading, too, three rules compare the filt
   by more than a radian would turn the wrong way. A start without any heading begins like this.
 
 Sources: P. Riseborough, yaw recovery from IMU and GPS data alone, ArduPilot, pull request 13603: a
-bank of filters that linearize about one heading each, for resets of the yaw by velocity; L.
+bank of filters that linearize about one heading each, for resets of the yaw by GNSS velocity; L.
 Kang et al., Mathematical Problems in Engineering 2014, 593692, for alignment in motion as a linear
 problem.
 """
@@ -253,7 +253,7 @@ def _lean_of(flight, p):
 
 @kernel
 def _measure_motion(flight, p, work, mask):
-    """Update v, u and d with the measured velocity, where there is one."""
+    """Update v, u and d with the GNSS velocity, where there is one."""
     fix = mask & (flight.block_valid[VELOCITY_BLOCK] > 0.0) & (flight.level_phase > 0.0)
     if not any_of(fix):
         return
@@ -544,7 +544,7 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
     """
     k = load33(flight.R_hat).T[2]
     vague = mask & (dot(k, load_symmetric(flight.P, E) @ k) > _VAGUE * _VAGUE)
-    if settings.by_motion < 2:  # otherwise a measured direction shows it again
+    if settings.by_motion < 2:  # otherwise a baseline or a camera shows it again
         flight.heading_lost = select(vague, 1.0, flight.heading_lost)
     lanes = mask & (flight.heading_lost > 0.0)
     work.held = zero_like(p.dt)

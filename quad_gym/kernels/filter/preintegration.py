@@ -62,7 +62,7 @@ from quad_gym.records import MAX_SLOW, SENSORS, FilterForm
 # so that the filter subtracts R d/dt [R^T (w x l)] = dw x l + w x (w x l) from each sample. The
 # gyro measures w at the instants, and its differences give dw. Their noise is the noise of R^T (w x
 # l) at the two ends of a tick and does not add up over ticks: it leaves |l| sigma_gyro in the
-# velocity, which is far below what any sensor of the position shows, and is not modeled.
+# velocity, which is far below the accuracy of GNSS and cameras, and is not modeled.
 # --------------------------------------------------------------------------------------------------
 
 LEVER_ARM = int(FilterForm.LEVER_AVERAGES | FilterForm.LEVER_SAMPLES)

@@ -11,7 +11,7 @@ improves these only if it is more accurate. White noise instead would have to be
 measurements had almost no weight. (R. G. Brown and P. Y. C. Hwang, Introduction to Random Signals
 and Applied Kalman Filtering, section on colored measurement noise.)
 
-The states are the drift of positions (three states in I, the first three of d), and the slow
+The states are the drift of GNSS positions (three states in I, the first three of d), and the slow
 errors of other sensors (`kernels/sensors/`): vectors first, then scalars. As blocks are 3 x
 3, their number is a multiple of three; the states that pad it are constant, with variance one, and
 never measured.

@@ -13,7 +13,7 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 
-Where a fix lacks a baseline, the field determines the heading of the filter's level start: the
+Where GNSS has one antenna, the field determines the heading of the filter's nearly level start: the
 expected field gets the measured direction. With the vertical k, the level direction h of the field
 and s = k x h, all in B, the field's level and vertical share m_h and m_z, the innovation vanishes
 along s, so that the derivative relates the heading's error to others:
