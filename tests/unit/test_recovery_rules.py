@@ -279,6 +279,21 @@ def test_reset_to_a_compass_explains_its_fields_by_hard_iron_where_others_show_t
     assert found[8] == pytest.approx(0.05 if confirmed else max(heading, 0.05))
 
 
+def test_reset_to_a_position_whose_drift_is_estimated_adds_the_drift():
+    """The drift gets its variance in the long run, which is part of the position's, too."""
+    nu = np.array([0.3, -0.4, 1.2])
+    rules = refused(LaneRules(DRIFTING), "gnss_position", nu=nu)
+    for row in range(15, 15 + rules.slow):
+        rules.set_sigma(row, 1e-3)
+    before = variances(rules)
+    rules.run(Stage.RECOVER)
+    np.testing.assert_array_equal(reset_counts(rules, "gnss_position"), 1.0)
+    drift = np.square(DRIFTING.gnss.drift_sigma_I)
+    expected = before.copy()
+    expected[:3], expected[15:18] = nu @ nu + drift, drift
+    np.testing.assert_allclose(variances(rules), expected, rtol=1e-9)
+
+
 def test_reset_to_ranges_takes_the_largest_valid_one():
     rules = refused(LaneRules(ALL), "uwb_range", nu=(-2.0, 0.0, 0.0))
     first = GROUP_BLOCK[GROUPS.index("uwb_range")]
