@@ -1,12 +1,16 @@
-"""First estimates from a baseline, `initialize` in `quad_gym.kernels.filter.starts`."""
+"""First estimates from a baseline or a magnetic field, `initialize` in
+`quad_gym.kernels.filter.starts` and `_align` in `quad_gym.kernels.sensors.magnetometer`."""
 
 import math
 
 import numpy as np
 import pytest
+from scipy import optimize
+from scipy.spatial.transform import Rotation
 
 from quad_gym.kernels.entries import start_filter
-from quad_gym.records import BASELINE_BLOCK, POSITION_BLOCK
+from quad_gym.kernels.stages import Stage
+from quad_gym.records import AID_BLOCK, BASELINE_BLOCK, POSITION_BLOCK, Act, Aid
 from quad_gym.rotations import euler_to_dcm
 from tests.lane_rules import LaneRules
 from tests.level_flights import MAGNETIC, R_IG
@@ -109,3 +113,72 @@ def test_vertical_baseline_shows_no_heading(known):
         np.testing.assert_allclose(
             np.sqrt(rules.covariance()[:, 6, 6]), tilt or attitude, rtol=1e-9
         )
+
+
+@pytest.mark.parametrize("heading", [0.3, -2.0])
+def test_level_start_has_the_heading_of_the_field_and_its_covariance(heading):
+    """Errors of tilt, declination, hard iron and noise move the heading, and all the position.
+
+    The field of the truth has no part across the field that the estimate expects. The expected
+    covariance has numerical derivatives of this condition.
+    """
+    scale, arm, compass = 2.0, np.array([0.2, -0.1, 0.3]), MAGNETIC.magnetometer
+    gnss = MAGNETIC.gnss.replace(primary_antenna_B=tuple(arm), secondary_antenna_B=None)
+    estimator = MAGNETIC.estimator.replace(initial_covariance_scale=scale)
+    suite = MAGNETIC.replace(gnss=gnss, estimator=estimator)
+    rules, R_BI = LaneRules(suite), euler_to_dcm([0.0, 0.0, heading])
+    m, k = np.array(compass.field_I), np.array([0.0, 0.0, 1.0])
+    level = np.append(m[:2], 0.0)
+    rules.set(P=np.tril(np.ones((15, 15))), P_slow=1.0)
+    rules.measured(POSITION_BLOCK, (PLACE + R_BI.T @ arm) @ R_IG)
+    rules.measured(AID_BLOCK[Aid.MAGNETOMETER], R_BI @ (1.3 * level - [0.0, 0.0, 2e-5]))
+    rules.initialize()
+    rules.run(Stage.MAGNETOMETER, flag=int(Act.ALIGN))
+    np.testing.assert_allclose(rules.get("R_hat")[0], R_BI, atol=1e-12)
+    np.testing.assert_allclose(rules.get("r_hat")[0], PLACE, atol=1e-12)
+
+    aside = np.cross(k, R_BI @ level)
+
+    def attitude(x):
+        """The true attitude: its heading is such that the field has no part aside."""
+
+        def part(e_z):
+            R = Rotation.from_rotvec([-x[0], -x[1], -e_z]).as_matrix() @ R_BI
+            return aside @ (R @ (m + x[2] * np.cross(m, k)) + x[3:6] + x[6:9])
+
+        e_z = optimize.brentq(part, -1.0, 1.0, xtol=1e-15)
+        return np.array([x[0], x[1], e_z])
+
+    def truth(x):
+        e = attitude(x)
+        R = Rotation.from_rotvec(-e).as_matrix() @ R_BI
+        return np.concatenate([PLACE + R_BI.T @ arm + x[9:12] - R.T @ arm, e, x[3:6], x[2:3]])
+
+    n = math.sqrt(scale)
+    unit = compass.strength  # of small steps
+    sigma = np.concatenate(
+        [
+            np.full(2, estimator.initial_tilt_sigma),
+            [compass.declination_sigma],
+            np.full(3, compass.hard_iron_sigma),
+            np.full(3, n * compass.noise_sigma),
+            n * np.array(gnss.position_sigma_I),
+        ]
+    )
+    steps = 1e-4 * np.diag([1.0] * 3 + [unit] * 6 + [1.0] * 3)
+    J = np.column_stack([(truth(h) - truth(-h)) / (2.0 * h.max()) for h in steps])
+    iron = 15 + int(rules.settings["aid_vector"][0, Aid.MAGNETOMETER])
+    turn = 15 + int(rules.settings["aid_scalar"][0, Aid.MAGNETOMETER])
+    height = 15 + int(rules.settings["aid_scalar"][0, Aid.BAROMETER])
+    found = rules.covariance()[0]
+    expected = np.eye(len(found))  # one for the states that fill a block
+    blocks = {3: math.sqrt(estimator.initial_velocity_variance), 9: suite.imu.accel_bias_sigma}
+    for row, value in (blocks | {12: suite.imu.gyro_bias_sigma}).items():
+        expected[row : row + 3, row : row + 3] *= value**2
+    expected[height, height] = suite.barometer.bias_sigma**2
+    rows = [0, 1, 2, 6, 7, 8, iron, iron + 1, iron + 2, turn]
+    expected[np.ix_(rows, rows)] = J @ np.diag(sigma**2) @ J.T
+    scaled = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found / np.outer(scaled, scaled), expected / np.outer(scaled, scaled), atol=1e-6
+    )

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from quad_gym.kernels.entries import FILTER_ENTRIES, FILTER_STAGES, linked_table
 from quad_gym.kernels.stages import Stage, needed_stages
+from quad_gym.packing import lever_form
 from quad_gym.records import POSITION_BLOCK, Sensor
+from quad_gym.rotations import euler_to_dcm
 from tests.lane_filter import EIGHT
 from tests.lane_rules import LaneRules
 from tests.level_flights import GRAVITY, MAGNETIC, R_IG
@@ -38,11 +40,14 @@ class LateRules(LaneRules):
 
     def __init__(self, suite):
         super().__init__(suite)
+        self.form |= int(lever_form(suite.imu))
+        self.settings["form"] = self.form
         self.settings["sensor_delay"][0, Sensor.GNSS] = DELAY
         self.settings["under_way"][0, Sensor.GNSS] = SLOT + 1
         self.settings["late"] = self.settings["rewinds"] = True
         stages = needed_stages(self.settings[0])
-        chosen = [s for s in (*FILTER_STAGES, Stage.LATE_UPDATE) if s in stages]
+        mine = (*FILTER_STAGES, Stage.INCREMENT, Stage.LATE_UPDATE)
+        chosen = [s for s in mine if s in stages]
         self._table = linked_table({s: stages[s] for s in chosen}, FILTER_ENTRIES)
 
     def put_sums(self, number, now, then):
@@ -51,10 +56,15 @@ class LateRules(LaneRules):
         self.put(number, **dict(zip(names, now, strict=True)))
         stamps = np.full(self.get("stamps").shape[1:], 7.0)
         stamps[:, :, 0] = self.tick - DELAY - 1.0 + np.arange(stamps.shape[1])[::-1]
-        row = np.concatenate([[self.tick - DELAY], *(np.ravel(part) for part in then)])
+        row = row_of(self.tick - DELAY, then)
         stamps[Sensor.GNSS, :, 0] = np.nan
         stamps[Sensor.GNSS, SLOT, : len(row)] = row
         self.put(number, stamps=stamps)
+
+
+def row_of(tick, sums):
+    """A time stamp with the sums (C, V, X, B) at that tick."""
+    return np.concatenate([[tick], *(np.ravel(part) for part in sums)])
 
 
 def skew(v):
@@ -199,3 +209,62 @@ def test_late_position_is_used_where_it_was_taken(drifts):
         np.testing.assert_array_equal(one[6:], other[6:])
     np.testing.assert_array_equal(rules.get("w_meas"), np.tile([0.1, 0.2, 0.3], (EIGHT, 1)))
     np.testing.assert_array_equal(rules.get("update_failures"), 0.0)
+
+
+@pytest.mark.parametrize("samples", ["instant", "average"])
+def test_sums_since_a_time_stamp_do_not_depend_on_the_instant_that_they_count_from(samples):
+    """That instant is moved every 32 ticks. The sums are the filter's own integration of a tick.
+
+    C <- turn C, V <- V + C^T f dt, X <- X + V dt + C^T f dt^2 / 2 and B <- B + C^T dt, where C of
+    averaged samples is halfway, and the accelerometer is mounted elsewhere.
+    """
+    arm, average, rng = (
+        np.array([0.05, -0.03, 0.02]),
+        samples == "average",
+        np.random.default_rng(1),
+    )
+    imu = OPEN.imu.replace(samples=samples, lever_arm_B=tuple(arm))
+    integration = "midpoint" if average else "euler"
+    estimator = OPEN.estimator.replace(integration=integration)
+    rules = LateRules(OPEN.replace(imu=imu, estimator=estimator))
+    dt, first, b_g = rules.dt, 64.0 * 1563 - 23.0, 0.01 * rng.normal(size=3)
+    zero = (np.eye(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)))
+    rules.put_sums(0, zero, zero)
+    rules.set(b_g_hat=b_g, tick=first)
+    stamps = rules.get("stamps")[0]
+    stamps[:, :, 0] = np.nan
+    stamps[Sensor.GNSS, SLOT, : len(row_of(first, zero))] = row_of(first, zero)
+    w_before = rng.normal(size=3)
+    C, V, X, B = zero
+    for k in range(100):
+        gyro, accel, w = 3.0 * rng.normal(size=(3, 3))
+        if k == 0:
+            rules.put(0, stamps=stamps)
+        rules.set(gyro=gyro, accel=accel, w_before=w_before, w_meas=w, tick=first + k)
+        rules.run(Stage.INCREMENT)
+        turn = euler_to_dcm(dt * gyro)
+        half, a, b = np.eye(3), w_before - b_g, w - b_g
+        if average:
+            half = turned(dt * gyro / 2.0)
+            turn = half @ half
+            accel = accel - (half.T @ np.cross(b, arm) - half @ np.cross(a, arm)) / dt
+        else:
+            accel = accel - np.cross((b - a) / dt, arm) - np.cross(b, np.cross(b, arm))
+        at = (half @ C).T
+        C, V, X, B = (
+            turn @ C,
+            V + dt * at @ accel,
+            X + dt * V + dt**2 / 2.0 * at @ accel,
+            B + dt * at,
+        )
+        w_before = w
+    now = tuple(rules.get(f"imu_{n}")[0] for n in ("turn", "velocity", "position", "bias_gain"))
+    row, T = rules.get("stamps")[0, Sensor.GNSS, SLOT], 100 * dt
+    then = (row[1:10].reshape(3, 3), row[10:13], row[13:16], row[16:25].reshape(3, 3))
+    assert row[0] == first
+    assert then[1].any()  # the instant has moved
+    C_s = then[0]
+    np.testing.assert_allclose(now[0] @ C_s.T, C, atol=1e-9)
+    np.testing.assert_allclose(C_s @ (now[1] - then[1]), V, atol=1e-9)
+    np.testing.assert_allclose(C_s @ (now[2] - then[2] - then[1] * T), X, atol=1e-9)
+    np.testing.assert_allclose(C_s @ (now[3] - then[3]), B, atol=1e-9)
