@@ -68,10 +68,14 @@ _OURS |= {"seed", "device", "tensorboard_log", "_init_setup_model"}
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
     """Class of an algorithm, by its name in `recipes.ALGORITHMS`."""
-    if name in ("recurrent_ppo", "tqc"):
+    if name == "recurrent_ppo":
+        from baselines.memory import SequencePPO
+
+        return SequencePPO
+    if name == "tqc":
         import sb3_contrib
 
-        return {"recurrent_ppo": sb3_contrib.RecurrentPPO, "tqc": sb3_contrib.TQC}[name]
+        return sb3_contrib.TQC
     return {"ppo": PPO, "sac": SAC, "td3": TD3}[name]
 
 

@@ -43,14 +43,14 @@ EPISODES = 1000  #: number of test episodes of each policy
 
 SECONDS_PER_MILLION: Mapping[str, float] = {
     "ppo": 16.0,
-    "recurrent_ppo": 185.0,
+    "recurrent_ppo": 130.0,
     "sac": 570.0,
     IMITATION: 60.0,
 }
 """Processor time of a million steps, by algorithm, until a training has been measured."""
 OUTAGE_SECONDS_PER_MILLION: Mapping[str, float] = {
     "ppo": 185.0,
-    "recurrent_ppo": 600.0,
+    "recurrent_ppo": 300.0,
     IMITATION: 200.0,
 }
 """Processor time of a million steps in OutageDash, whose steps last 0.1 to 0.25 s."""
