@@ -276,7 +276,8 @@ def chosen(count: int, seed: int) -> list[Mutant]:
 def with_callers(mutant: Mutant) -> Mutant:
     """Return a mutant of a kernel with words of the kernels that call its function, and so on.
 
-    Words of a caller count half as much as those of the function that it calls.
+    Words of a caller count half as much as those of the function that it calls. A function that no
+    kernel calls by its name, as a function of a sensor's stage, keeps its own words.
     """
     weights, names, weight = Counter[str](), {mutant.function} - {""}, 2.0
     seen = set(names)
@@ -289,7 +290,7 @@ def with_callers(mutant: Mutant) -> Mutant:
                     weights[word] = max(weights[word], share * weight)  # type: ignore[assignment]
         names = {kernel[1] for kernel in found}
         seen |= names
-    return mutant._replace(weights=tuple(weights.items()), function="")
+    return mutant._replace(weights=tuple(weights.items()), function="") if weights else mutant
 
 
 @functools.cache

@@ -165,6 +165,8 @@ def test_words_of_callers_count_less_with_each_call(tmp_path, monkeypatch):
     mutants._kernels.cache_clear()
     mutant = mutants.Mutant("quad_gym/kernels/sums.py", 2, "", "", (), "inner")
     weights = dict(mutants.with_callers(mutant).weights)
+    uncalled = mutants.Mutant("quad_gym/kernels/sums.py", 8, "", "", (("other", 2.0),), "other")
+    assert mutants.with_callers(uncalled) == uncalled
     mutants._kernels.cache_clear()
     assert weights == {"sum": 1.5, "middle": 1.0, "rate": 0.5, "outer": 0.5}
 
