@@ -103,7 +103,7 @@ def _value(value: Any) -> str:
     if isinstance(value, quad_gym.RewardParams):
         return "`RewardParams()`"
     if isinstance(value, tuple) and value:
-        return f"{len(value)} of them"
+        return ", ".join(f"`{type(part).__name__}`" for part in value)
     return f"`{value!r}`"
 
 

@@ -137,7 +137,8 @@ def fly(env: Any, policy: Policy, seed: int, about: Any) -> Iterator[Flight]:
     """Run an episode, and yield the flight so far after each step."""
     for flight, ending in fly_steps(policy, env, seed, about | {"seed": seed}):  # noqa: B007
         yield flight
-    words = f"seed {seed}: {ending.replace('_', ' ')} after {flight['time'][-1]:.2f} s, "
+    ended = "ended by the task" if ending == "task" else ending.replace("_", " ")
+    words = f"seed {seed}: {ended} after {flight['time'][-1]:.2f} s, "
     gates = gates_of(env)
     if gates:
         words += f"{int(flight['gates_passed'][-1])} of {gates} gates passed"

@@ -45,7 +45,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; by default a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; by default 10 s |
     | `QuadGym/LookAround-v0` | as in `RandomTrajectory`; no GNSS, markers on one wall, looking at them costs reward | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates with a radius of 0.6 m; measurements arrive late, and the filter ignores their time stamps | hovering near the origin | 20 s |
-    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west, with velocity commands; GNSS fails for 5 to 15 s | hovering before the first wall | 45 s |
+    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west, with velocity commands; GNSS fails again and again, for 5 to 15 s | hovering before the first wall | 90 s |
 
     The classes of the last three specify their observation and reward:
     `quad_gym.tasks.look_around.LookAround`, `stale_race.StaleRace` and `outage_dash.OutageDash`.

@@ -14,6 +14,7 @@ import re
 import shlex
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 import quad_gym
@@ -229,6 +230,15 @@ def test_every_public_name_is_on_api_pages():
     wanted |= {"frames", "rendering", "rotations", "sensors", "tasks.rewards", "vehicle"}
     missing = {f"quad_gym.{name}" for name in wanted} - modules
     assert not missing, sorted(missing)
+
+
+@pytest.mark.parametrize("env_id", sorted({*quad_gym.IDS} - {"QuadGym/Trajectory-v0"}))
+def test_table_of_environments_has_the_time_limit_of_each(env_id):
+    task = gymnasium.make(env_id).unwrapped.flights.task
+    tables = (quad_gym.QuadEnv.__doc__, (ROOT / "docs/environments.md").read_text())
+    for table in tables:
+        row = re.search(rf"^ *\| `{env_id}` \|.*\|(.*)\|$", table, re.MULTILINE)
+        assert float(re.findall(r"(\d+) s", row[1])[-1]) == task.duration
 
 
 def test_files_to_read_first_have_about_1500_lines():
