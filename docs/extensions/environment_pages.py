@@ -103,7 +103,8 @@ def _value(value: Any) -> str:
     if isinstance(value, quad_gym.RewardParams):
         return "`RewardParams()`"
     if isinstance(value, tuple) and value:
-        return ", ".join(f"`{type(part).__name__}`" for part in value)
+        kinds = ", ".join(f"`{type(part).__name__}`" for part in value)
+        return f"{len(value)} of them" if isinstance(value[0], tuple) else kinds
     return f"`{value!r}`"
 
 

@@ -283,6 +283,23 @@ def test_vertical_that_leaves_the_level_frame_is_wrong_in_two_fixes_in_a_row(
     np.testing.assert_array_equal(once.get("level_lean"), [*[0.0] * 4, *(1.0 - far[4:])])
 
 
+def squared_by_variances(sigma_tilt, lean):
+    """Sixteen variances of the tilts of N and of the filter, 0.05 rad but 0.02 about its own z."""
+    about_z = 0.02**2 * math.cos(lean) ** 2 + 0.05**2 * math.sin(lean) ** 2
+    return 16.0 * (sigma_tilt**2 + 0.5 * (2.0 * 0.05**2 + 0.02**2 - about_z))
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_large_first_tilt_may_lean_by_four_standard_deviations(confirmed):
+    first, sigma = 0.001, 0.07
+    for share, found in ((0.99, 0.0), (1.01, 1.0)):
+        lean = 0.3
+        for _ in range(20):  # the limit depends on the lean
+            lean = share * angle(squared_by_variances(sigma, lean) + 12.0 * first)
+        rules = leaning([lean] * EIGHT, confirmed, sigma, first, level_force=[0.0, 0.0, 0.6])
+        np.testing.assert_array_equal(rules.get("compass_out"), found)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -300,9 +317,11 @@ def test_vertical_is_not_compared_without_a_fix_or_a_known_heading(changes):
 @pytest.mark.parametrize("time", [0.0, 10.0])
 def test_first_tilt_beyond_the_usual_one_allows_a_larger_lean(time):
     """The first variance counts twelve times, and falls as N is leveled at 0.06 per second."""
-    first = 0.01
-    square = 0.087**2 + 12.0 * first * math.exp(-2.0 * 0.06 * time)
-    lean = angle(square) * np.repeat([0.99, 1.01], 4)
+    first, lean = 0.01, 0.3
+    for _ in range(20):
+        square = squared_by_variances(0.001, lean) + 12.0 * first * math.exp(-2.0 * 0.06 * time)
+        lean = angle(square)
+    lean = lean * np.repeat([0.99, 1.01], 4)
     rules = leaning(lean, False, 0.001, first, level_force=[0.0, 0.0, time])
     np.testing.assert_array_equal(rules.get("compass_out"), np.repeat([0.0, 1.0], 4))
     tilt = 0.05**2 + first * math.exp(-2.0 * 0.06 * time)

@@ -417,7 +417,10 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     unconfirmed = (flight.tick - flight.level_tick) * p.dt > RECENT
     tilt = flight.level_P[2] / (2.0 * p.gravity * p.gravity)  # variance of that of N, per axis
     limit = clip(_LEANS * tilt, _LEAN * _LEAN, _MOST_LEAN * _MOST_LEAN)
-    limit = select(unconfirmed, limit, _LARGE_LEAN * _LARGE_LEAN) + _LEANS * first
+    limit = select(unconfirmed, limit, _LARGE_LEAN * _LARGE_LEAN)
+    # a large first tilt is only as well known as d and the filter say
+    both = _AGAINST * (tilt + 0.5 * _tilt_of(flight))
+    limit = select(flight.level_first > 0.0, maximum(limit, both), limit) + _LEANS * first
     leans = fresh & (dot(lean, lean) > limit) & ruled
     leans = leans & (flight.level_phase > 1.0)
     row = select(fresh, select(leans, flight.level_lean + 1.0, 0.0), flight.level_lean)
