@@ -385,7 +385,7 @@ def when_to_train(rows: Rows) -> str:
         [
             case.task,
             f"`{case.suite}`",
-            _shown(case.rule.estimated(case.column), case.column),
+            _shown(case.rule.estimated(case.column), case.column, rule=True),
             _shown(case.ideal.estimated(case.column), case.column),
             _shown(case.cost.size, case.column),
             LINE.join([_shown(case.gain.size, case.column), *findings(case.gain)]),
@@ -426,10 +426,12 @@ def _listed(names: list[str]) -> str:
     return f" ({', '.join(names)})" if names else ""
 
 
-def _shown(found: Estimated, column: str) -> str:
-    """Errors in millimeters, rates in percent."""
+def _shown(found: Estimated, column: str, rule: bool = False) -> str:
+    """Errors in millimeters, rates in percent; the mean error of a rule has no interval."""
     scale, unit = (100.0, "%") if column == "success" else (1e3, "mm")
-    return f"{number(Estimated(*(scale * value for value in found)), 0)} {unit}"
+    scaled = Estimated(*(scale * value for value in found))
+    text = f"{scaled.value:.0f}" if rule and column == "error" else number(scaled, 0)
+    return f"{text} {unit}"
 
 
 def arms_table(name: str, steps: int) -> Conclusion:

@@ -249,7 +249,7 @@ def test_cost_and_gain_have_signs_of_loss_and_recovery_and_list_measured_cases_o
     found = conclusions.texts(tmp_path)
     circle, waypoints = found["when_to_train.table"].strip().splitlines()[2:]
     # the errors are 0.1, 0.5 and 0.2 m; of 0.4 m that the estimate costs, training regains 0.3 m
-    assert circle.startswith("| Circle | `standard` | 300 ")
+    assert circle.startswith("| Circle | `standard` | 300 mm |")
     assert "| 100 [100, 100] mm | 400 [400, 400] mm | 300 [300, 300] mm<br>p < 0.001" in circle
     assert "| 90 [" in waypoints
     assert "| 40 [" in waypoints
