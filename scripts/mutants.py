@@ -70,6 +70,8 @@ _COPIED = (
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "CITATION.cff",
+    "LICENSE",
+    "SECURITY.md",
 )
 _LEFT_OUT = {"tests/contract/test_golden.py", "tests/scripts/test_mutants.py"}
 _COSTLY = {

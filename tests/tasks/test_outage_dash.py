@@ -129,6 +129,19 @@ def test_observation_is_computed_from_the_observed_state(observation):
     assert {0, 1, 2} <= passed
 
 
+def test_bounds_of_the_observation_are_the_built_in_ones_and_fit_each_other():
+    """A width is not negative, and no larger than the distance of the next two gaps may be."""
+    ours, builtin = (
+        {f.name: (f.low, f.high, f.unit) for f in env.unwrapped.flights.table}
+        for env in (make(1), gymnasium.make_vec("QuadGym/Circle-v0", num_envs=1))
+    )
+    for name in ("velocity_error", "up", "heading", "body_rates"):
+        assert ours[name] == builtin[name]
+    least, most, _ = ours["next_gap"]
+    assert least == -most
+    assert ours["gap_width"] == ours["next_width"] == (0.0, most, "m")
+
+
 def test_reward_after_the_finish_is_zero():
     env = make(2, observation="truth", **FAST)
     env.reset(seed=0, options={"position": (-65.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
