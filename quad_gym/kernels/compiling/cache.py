@@ -174,24 +174,33 @@ def _is_string(statement: ast.AST) -> bool:
 @functools.cache
 def _known_sources() -> dict[str, tuple[str, list[str]]]:
     """Earlier results of `_parsed`, stored when a process ends: parsing takes over a second."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).with_name("__pycache__"))
-    file = folder / f"quad_gym_digests.{sys.implementation.cache_tag}.json"
     known: dict[str, tuple[str, list[str]]] = {}
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):  # none, or damaged
-        for key, (digest, names) in json.loads(file.read_text()).items():
+        for key, (digest, names) in json.loads(_digests_file().read_text()).items():
             known[key] = str(digest), list(names)
-    count = len(known)
-
-    @atexit.register
-    def save() -> None:
-        temporary = file.with_suffix(f".{os.getpid()}.tmp")
-        if len(known) > count:
-            with contextlib.suppress(OSError):
-                folder.mkdir(parents=True, exist_ok=True)
-                temporary.write_text(json.dumps(dict(list(known.items())[-1000:])))
-                temporary.replace(file)
-
+    atexit.register(_save_sources, len(known))
     return known
+
+
+def _digests_file() -> Path:
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).with_name("__pycache__"))
+    return folder / f"quad_gym_digests.{sys.implementation.cache_tag}.json"
+
+
+def _save_sources(count: int) -> None:
+    """Store the results of `_parsed` if there are more than `count`."""
+    file, known = _digests_file(), _known_sources()
+    temporary = file.with_suffix(f".{os.getpid()}.tmp")
+    if len(known) > count:
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(dict(list(known.items())[-1000:])))
+            temporary.replace(file)
+
+
+def save_digests() -> None:
+    """Store the digests of sources now, so that processes that this one starts parse none."""
+    _save_sources(0)
 
 
 _JUMPS = {*dis.hasjrel, *dis.hasjabs}

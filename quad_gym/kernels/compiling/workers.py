@@ -17,17 +17,23 @@ import sys
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from quad_gym.kernels.compiling.cache import CodeCache, locked, where_cached
+from numba.core.registry import cpu_target
+
+from quad_gym.kernels.compiling.cache import CodeCache, locked, save_digests, where_cached
 from quad_gym.kernels.library import available_cores, say
 
 MAX_WORKERS = 8
 _START = (
-    "import sys; sys.path[:] = {path!r}; from {module} import work; work({names!r}, {claims!r})"
+    "import sys; sys.path[:] = {path!r}; from {module} import work; "
+    "work({names!r}, {claims!r}, {copies!r})"
 )
+_FORKS = sys.platform == "linux"
+"""True where workers are copies of one process, which imports Numba once for all of them."""
 
 
 def dispatcher_of(name: str) -> Any:
@@ -80,11 +86,15 @@ def _compile(names: Sequence[str], processes: int) -> None:
 def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progress") -> None:
     """Compile `names` into the cache, in processes; failures are skipped."""
     path = [folder for folder in sys.path if isinstance(folder, str)]
+    started, copies = (1, workers) if _FORKS else (workers, 0)
+    save_digests()
     with tempfile.TemporaryDirectory() as claims, contextlib.ExitStack() as running:
-        code = _START.format(path=path, module=__name__, names=list(names), claims=claims)
+        code = _START.format(
+            path=path, module=__name__, names=list(names), claims=claims, copies=copies
+        )
         processes = []
         with contextlib.suppress(OSError):  # out of memory or of processes: fewer workers
-            for _ in range(workers):
+            for _ in range(started):
                 process = subprocess.Popen(
                     [sys.executable, "-c", code],
                     stdin=subprocess.PIPE,  # which closes when this process ends
@@ -100,10 +110,35 @@ def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progre
             time.sleep(0.1)
 
 
-def work(names: Sequence[str], claims: str) -> None:
-    """Run a worker."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def work(names: Sequence[str], claims: str, copies: int = 0) -> None:
+    """Run a worker, or copies of it, which begin with all imports done; ends the process."""
     gc.disable()  # compiling makes few cycles, and looking for them takes a tenth of the time
+    for name in names:
+        dispatcher_of(name)  # imports its module
+    cpu_target.target_context.refresh()  # imports the rest of Numba
+    forked = _forked(copies)
+    threading.Thread(target=_end_with_parent, daemon=True).start()  # threads are not copied
+    if not forked:
+        _compile_unclaimed(names, claims)
+    for process in forked:
+        os.waitpid(process, 0)
+    os._exit(0)  # otherwise Python frees each object, which takes a tenth of the time, too
+
+
+def _forked(copies: int) -> list[int]:
+    """Copy this process; returns the identifiers of the copies, and nothing in a copy itself."""
+    forked: list[int] = []
+    warnings.simplefilter("ignore", DeprecationWarning)  # of threads: those of BLAS are idle
+    with contextlib.suppress(OSError):  # out of memory or of processes: fewer workers
+        for _ in range(copies):
+            process = os.fork()
+            if process == 0:
+                return []
+            forked.append(process)
+    return forked
+
+
+def _compile_unclaimed(names: Sequence[str], claims: str) -> None:
     for number, name in enumerate(names):
         with contextlib.suppress(FileExistsError):
             Path(claims, str(number)).touch(exist_ok=False)
