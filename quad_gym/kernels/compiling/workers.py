@@ -24,6 +24,7 @@ from typing import Any
 
 from numba.core.registry import cpu_target
 
+from quad_gym.kernels.compiling import shortcuts
 from quad_gym.kernels.compiling.cache import CodeCache, locked, save_digests, where_cached
 from quad_gym.kernels.library import available_cores, say
 
@@ -113,6 +114,7 @@ def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progre
 def work(names: Sequence[str], claims: str, copies: int = 0) -> None:
     """Run a worker, or copies of it, which begin with all imports done; ends the process."""
     gc.disable()  # compiling makes few cycles, and looking for them takes a tenth of the time
+    shortcuts.take()
     for name in names:
         dispatcher_of(name)  # imports its module
     cpu_target.target_context.refresh()  # imports the rest of Numba

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from tests.unit.compiling.parts import RIGHT, Parts, alive, wait_until
+from tests.unit.compiling.parts import PREPARE, RIGHT, Parts, alive, wait_until
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="it reads /proc")
 MANY = """
@@ -49,6 +49,17 @@ def test_parts_are_compiled_once_and_by_worker_processes(parts):
     assert "compiled 3 of 3 kernels" in said.splitlines()[-1]
     assert parts.run() == (RIGHT, "")  # all of it comes from the cache
     assert parts.compiled() == ["a", "b", "c"]
+
+
+@linux
+def test_workers_of_other_systems_are_not_copies_of_one_process(parts):
+    without = "from quad_gym.kernels.compiling import workers\nworkers._FORKS = False\n"
+    process = parts.start(PREPARE.replace("prepare(parts", without + "prepare(parts"))
+    output, said = process.communicate(timeout=600)
+    assert (process.returncode, output.strip()) == (0, RIGHT), said
+    assert parts.compiled() == ["a", "b", "c"]
+    assert process.pid not in parts.compilers()
+    assert len(parts.files("code")) == 3
 
 
 @pytest.mark.slow
