@@ -25,6 +25,7 @@ from quad_gym.kernels.sources import sources_digest
 from quad_gym.kernels.stages import STAGE_TABLE, Stage
 from quad_gym.params import checks as check
 from quad_gym.records import (
+    ALIGNED,
     FLIGHT_BLOCK,
     PRECISION,
     RESULTS,
@@ -146,11 +147,6 @@ class CudaLauncher:
 #
 # It needs NumPy and torch, and no compiler: plan and kernel may be made elsewhere.
 # --------------------------------------------------------------------------------------------------
-
-
-ALIGNED = 4 * WARP
-"""Bytes of a number of all flights of a block in single precision, of which the addresses of blocks
-are multiples (`kernels/numbers/blocks.py`)."""
 
 
 class Launcher(Protocol):

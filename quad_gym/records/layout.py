@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from quad_gym.records.flight import FLIGHT_FIELDS, PARTS, WORK_FIELDS
 from quad_gym.records.params import PARAMS_FIELDS, SETTINGS_FIELDS
 from quad_gym.records.sizes import (
+    ALIGNED,
     FIRST_BLOCK,
     MAX_BLOCKS,
     REAL,
@@ -92,9 +93,9 @@ def room_of(used: frozenset[str]) -> Room:
 
 
 def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
-    """Return `count` zeroed records that begin on a cache line, as blocks of a GPU on two."""
-    raw = np.zeros(count * dtype.itemsize + 128, np.uint8)
-    start = -raw.ctypes.data % 128
+    """Return `count` zeroed records at an address that is a multiple of ALIGNED."""
+    raw = np.zeros(count * dtype.itemsize + ALIGNED, np.uint8)
+    start = -raw.ctypes.data % ALIGNED
     return raw[start : start + count * dtype.itemsize].view(dtype)
 
 

@@ -56,6 +56,9 @@ def require_double(what: str) -> None:
 WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
 SINGLE_WIDTHS = (1, 2, 4, 8, 16)  #: the same in single precision
 WARP = 32  #: number of flights in a block on a GPU, whose threads fly one each
+ALIGNED = 4 * WARP
+"""Bytes of which the addresses of records are multiples: two cache lines, and a number of all flights
+of a block on a GPU in single precision (`kernels/numbers/blocks.py`)."""
 RESIDENT = 8  #: blocks that a multiprocessor of a GPU flies at once, with 255 registers a thread
 _NEEDED = {
     64: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
