@@ -31,6 +31,7 @@ from quad_gym.records import (
     COLUMNS,
     FIRST_AID,
     FIRST_BLOCK,
+    FIRST_GROUP,
     FOLLOWED,
     GROUP_COUNT,
     GROUP_FREEDOMS,
@@ -128,7 +129,7 @@ class SlowStates(NamedTuple):
     """slow errors, padded to a multiple of three by constants with standard deviation one"""
     estimated: int  #: number of slow errors without the padding
     drifts: bool
-    """True if the first three are the drift of GNSS positions, which is zero at the start"""
+    """True if the first three are the drift of a sensor, which is zero at the start"""
     vectors: tuple[int, ...]
     """index of the first of an aiding sensor's three errors, in the order of `Aid`; -1: none"""
     scalars: tuple[int, ...]
@@ -167,7 +168,7 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
 
 
 def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
-    """Return the blocks of innovations of a suite: position, baseline, velocity, features, aids."""
+    """Return the blocks of innovations of a suite, in the order of its readings."""
     counts = sensor_blocks(sensors)
     return tuple(
         first + k for first, count in zip(FIRST_BLOCK, counts, strict=True) for k in range(count)
@@ -177,8 +178,8 @@ def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
 def sensor_blocks(sensors: SensorSuite) -> tuple[int, ...]:
     """Return the number of blocks of each sensor.
 
-    A sensor of several readings has a block for each, also where it does not measure it: a mark
-    gives the first position and baseline where there is no GNSS.
+    A sensor of several readings has a block for each, also where it does not measure it, as a mark
+    may give the first one.
     """
     counts = []
     for name, count in zip(SENSOR_PARAMS, GROUP_COUNT, strict=True):
@@ -199,7 +200,6 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
     states = slow_states(sensors)
     p["slow_sigma"][: len(states.errors)] = states.first_sigmas
     for aid, params in sensors.aids.items():
-        p["aid_scale"][aid] = params.scale
         p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.noise_sigma, params.matrix_sigma
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
@@ -216,20 +216,6 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
             p["aid_numbers"][row] = numbers
 
 
-def follows_motion(sensors: SensorSuite) -> int:
-    """Return 1 if a suite's filter compares its heading with the motion, by GNSS velocities.
-
-    With a baseline or a camera, which measure the heading better, it is 2: the motion only shows a
-    heading that is unknown. Without GNSS velocities or a gate it is 0.
-    """
-    if not sensors.blocks_of("gnss_velocity"):
-        return 0
-    if not sensors.estimator.false_alarm_probability > 0.0:
-        return 0
-    directions = (name for name, reading in READINGS.items() if reading.direction)
-    return 2 if any(map(sensors.blocks_of, directions)) else 1
-
-
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     """Write the sensors that a filter assumes into a SETTINGS record, with their slow errors."""
     states = slow_states(sensors)
@@ -238,10 +224,13 @@ def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     velocity = any(params.reads_velocity for params in sensors.sensors.values())
     settings["motion_columns"] = 9 if velocity else 6
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
-    settings["by_motion"] = follows_motion(sensors)
+    settings["by_motion"] = sensors.heading_by_motion
     heading = sensors.heading_aid
     settings["heading_sensor"] = -1 if heading is None else FIRST_AID + heading
     settings["sensor_blocks"] = sensor_blocks(sensors)
+    settings["reading_blocks"] = [
+        sensors.blocks_of(name) or int(sensors.gives(name)) for name in READINGS
+    ]
     settings["feature_count"] = sensors.blocks_of("pixels")
 
 
@@ -289,6 +278,7 @@ def params_record(
             else:
                 p[name] = value
     _pack_mark(p, sensors)
+    _pack_raw(p, sensors)
     pack_aids(p, sensors)
     pack_tick(p, sensors)
     _pack_filter(p, sensors)
@@ -352,6 +342,15 @@ def _pack_mark(p: Any, sensors: SensorSuite) -> None:
             p[field] = value
 
 
+def _pack_raw(p: Any, sensors: SensorSuite) -> None:
+    """Write the units of readings in raw observations."""
+    p["raw_scale"] = p["raw_span"] = 1.0
+    for name, sensor in sensors.sensors.items():
+        first = FIRST_GROUP[Sensor[name.upper()]]
+        groups = slice(first, first + len(sensor.measured_blocks))
+        p["raw_scale"][groups], p["raw_span"][groups] = sensor.raw_scales, sensor.raw_spans
+
+
 def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     """Write the sigma points, noise models and gates of the filter."""
     estimator = sensors.estimator
@@ -362,8 +361,7 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     p["noise_pinhole"] = estimator.bearing_noise_at == "pinhole"
     alarm = estimator.false_alarm_probability
     p["gate"] = [gate_limit(freedoms, alarm) for freedoms in GROUP_FREEDOMS]
-    fixed = sensors.blocks_of("gnss_position") > 0
-    sigma = estimator.max_direction_sigma if fixed else math.inf
+    sigma = estimator.max_direction_sigma if sensors.has_fixes else math.inf
     p["gate_uncertainty"] = sigma * sigma
 
 
@@ -581,8 +579,16 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     s["action_delays"] = c.longest_delay
     pack_places(s, c.draws, c.flown_sensors, assumed)
     pack_faults(s, c.possible_faults, assumed.imu.dt)
-    _pack_sensors(s, c)
+    _pack_sensors(s, c.sensors, c.flown_sensors)
     return record
+
+
+def sensor_settings(sensors: SensorSuite) -> NDArray[Any]:
+    """Return a settings record that holds only the options of sensors, shape (1,)."""
+    settings = np.zeros(1, SETTINGS)
+    settings["run_filter"] = True
+    _pack_sensors(settings[0], sensors, sensors)
+    return settings
 
 
 def _pack_task(s: Any, task: TaskParams) -> None:
@@ -613,15 +619,12 @@ def _pack_task(s: Any, task: TaskParams) -> None:
         s[name] = getattr(task, name)
 
 
-def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
+def _pack_sensors(s: Any, assumed: SensorSuite, true: SensorSuite) -> None:
     """Write clocks, delays and quantities of the sensors, and the errors that the filter estimates.
 
     Rates, phases and measured quantities of the true and the assumed sensors are the same.
     """
-    assumed, true = c.sensors, c.flown_sensors
     s["imu_averages"] = assumed.imu.samples == "average"
-    s["gnss_velocity"] = assumed.gives("gnss_velocity")
-    s["gnss_baseline"] = assumed.gives("gnss_baseline")
     pack_sensors(s, assumed)
     for name, sensor in true.sensors.items():
         place, label = Sensor[name.upper()], type(sensor).__name__

@@ -39,7 +39,7 @@ from quad_gym.kernels.compiling.cache import CodeCache
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
 from quad_gym.kernels.compiling.linking import KernelDispatcher
 from quad_gym.kernels.compiling.workers import dispatcher_of
-from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE, names_of, run_stage
+from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE, names_of
 from quad_gym.kernels.stages import SOURCES
 
 _USUAL = ("gymnasium", "hypothesis", "quad_gym", "quad_gym.envs", "scipy.linalg", "scipy.stats")
@@ -55,7 +55,7 @@ class Unsuitable(Exception):  # noqa: N818  # no error: the line is broken in an
 def every_name() -> list[str]:
     """Return the names of all stages and entries."""
     stages = names_of([source.name for source in SOURCES])
-    return [*stages, *FILTER_ENTRIES, *SENSORS_AND_VEHICLE, run_stage.name]
+    return [*stages, *FILTER_ENTRIES, *SENSORS_AND_VEHICLE]
 
 
 class Kernels:

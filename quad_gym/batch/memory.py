@@ -50,7 +50,7 @@ def _place_of(reading: str) -> tuple[str, tuple[int | slice, ...]]:
 
 
 _PARTS_OF: dict[str, tuple[str, tuple[int | slice, ...]]] = {
-    "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),  # in suites with this drift
+    "drift_hat": ("slow_hat", (slice(0, 3),)),  # in suites with a sensor that drifts
     **{name: _place_of(name) for name in READINGS},
 }
 """Names of parts of fields."""

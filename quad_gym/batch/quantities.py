@@ -16,7 +16,7 @@ from quad_gym.batch.memory import FlightMemory
 from quad_gym.packing import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.aids import ReadingDefinition
-from quad_gym.params.sensor_table import READINGS
+from quad_gym.params.sensor_table import DRIFTING, READINGS, SENSOR_PARAMS
 from quad_gym.records import (
     BLOCKS_OF,
     HEADING_ALONG,
@@ -171,6 +171,16 @@ def _of_reading(reading: ReadingDefinition) -> Quantity:
     return Quantity(_read(reading), reading.dimensions, *about, filtered=True)
 
 
+def _of_drift(sensor: str, estimated: bool = False) -> Quantity:
+    """The drift of a sensor, of its first reading, or the filter's estimate."""
+    reading = SENSOR_PARAMS[sensor].readings(sensor)[0]
+    about = (reading.length,), reading.unit, reading.frame
+    if not estimated:
+        return Quantity("drift", *about, f"time-correlated error of `{reading.name}`")
+    meaning = f"the filter's estimate of `{sensor}_drift`"
+    return Quantity("drift_hat", *about, meaning, filtered=True, builtin=True)
+
+
 # fmt: off
 QUANTITIES = {
     "time": Quantity(_time, (), "s", "-", "time since the start of the episode"),
@@ -184,7 +194,7 @@ QUANTITIES = {
     "rotor_speeds": Quantity("rotor_speeds", (4,), "rad/s", "-", "true speeds of the four rotors"),
     "accel_bias": Quantity("b_a", (3,), "m/s^2", "B", "true bias of the accelerometer"),
     "gyro_bias": Quantity("b_g", (3,), "rad/s", "B", "true bias of the gyro"),
-    "gnss_drift": Quantity("gnss_drift", (3,), "m", "I", "time-correlated error of GNSS positions"),
+    **{f"{name}_drift": _of_drift(name) for name in DRIFTING},
     "disturbance": Quantity("disturbance", (3,), "N", "I", "external force on the body"),
     "wind": Quantity("wind", (3,), "m/s", "I", "velocity of the air"),
     "faults": Quantity("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`", int),
@@ -196,7 +206,7 @@ QUANTITIES = {
     "estimated_body_rates": Quantity(_estimated_rates, (3,), "rad/s", "B", "measured rates minus the estimated bias", filtered=True),
     "estimated_accel_bias": Quantity("b_a_hat", (3,), "m/s^2", "B", "the filter's estimate of `accel_bias`", filtered=True),
     "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`", filtered=True),
-    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True, builtin=True),
+    **{f"estimated_{name}_drift": _of_drift(name, estimated=True) for name in DRIFTING},
     "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`", int),
     "filter_diverged": Quantity("diverged", (), "-", "-", "the filter flags itself as diverged: the covariance does not explain the last innovations (filters with an innovation gate, or with `faults`, `truncate_when_diverged` or `innovations`)", bool),
     "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update; NaN: it was done in steps", filtered=True, builtin=True),

@@ -523,17 +523,16 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
 def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
     """Fields that exceed their bounds: name, value, bound and unit."""
     pose, source, bounds = sensors.initial_pose, sensors.heading_source, []
-    fixes = sensors.blocks_of("gnss_position") > 0
     heading = None if source is None else source.first_heading
     if heading is not None:
         most = MAX_HEADING_SIGMA if heading.lasting else MAX_BASELINE_SIGMA
         name = f"{type(source).__name__}.{heading.field}"
         bounds.append((name, heading.sigma, most * heading.per_radian, heading.unit))
     else:
-        images = not fixes and sensors.blocks_of("pixels") > 0
+        images = not sensors.has_fixes and sensors.blocks_of("pixels") > 0
         most = MAX_HEADING_SIGMA_INDOORS if images else MAX_HEADING_SIGMA
         bounds.append(("InitialPoseParams.heading_sigma", pose.heading_sigma, most, "rad"))
-    if not fixes:
+    if not sensors.has_fixes:
         sigma = pose.position_sigma
         bounds.append(("InitialPoseParams.position_sigma", sigma, MAX_POSITION_SIGMA, "m"))
     return ((name, value, most, unit) for name, value, most, unit in bounds if value > most)

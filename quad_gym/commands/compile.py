@@ -83,7 +83,7 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
         SENSORS_AND_VEHICLE,
         names_of,
     )
-    from quad_gym.kernels.stages import SOURCES, needed_stages
+    from quad_gym.kernels.stages import SOURCES, STAGES_OF, needed_stages
     from quad_gym.records import Autoreset
 
     needed: set[str] = set()
@@ -95,7 +95,8 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
         needed = {source.name for source in SOURCES}
     names = names_of(needed) if needed else []
     if {"single", "all"} & set(kinds):
-        filters = names_of({s.name for s in SOURCES if s.stage in FILTER_STAGES}, FILTER_ENTRIES)
+        stages = {*FILTER_STAGES, *(stage for stages in STAGES_OF.values() for stage in stages)}
+        filters = names_of({s.name for s in SOURCES if s.stage in stages}, FILTER_ENTRIES)
         names = [*filters, *names, *SENSORS_AND_VEHICLE]
     return list(dict.fromkeys(names))
 

@@ -28,7 +28,7 @@ from quad_gym.estimation.starts import (
     moments,
     update_and_weigh,
 )
-from quad_gym.packing import blocks_of, follows_motion
+from quad_gym.packing import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.checks import takes
 from quad_gym.params.sensor_table import AID_PARAMS, READINGS
@@ -560,7 +560,7 @@ class KalmanFilter(FilterEstimate):
         if self._log_weights is not None:
             form &= ~_OF_GATES
         engine.settings["form"] = form
-        engine.settings["by_motion"] = follows_motion(self.sensors) if self.is_single else 0
+        engine.settings["by_motion"] = self.sensors.heading_by_motion if self.is_single else 0
 
     def warn_of_news(self, before: FilterStatus) -> None:
         """Warn of failures that `status` did not have before."""

@@ -18,7 +18,7 @@ from quad_gym.estimation.inputs import (
 )
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
-from quad_gym.packing import follows_motion, slow_states
+from quad_gym.packing import slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.gnss import STEEP
 from quad_gym.params.portable import turned
@@ -498,7 +498,7 @@ def _without_heading(first: FirstEstimate, arm_B: Floats) -> FirstEstimate:
 
 def _waits_for_motion(sensors: SensorSuite) -> bool:
     """Return True if one filter waits for its heading: no camera needs to weigh headings."""
-    return follows_motion(sensors) > 0 and sensors.camera is None
+    return sensors.heading_by_motion > 0 and sensors.camera is None
 
 
 def _require_relative(position_G: Floats) -> None:

@@ -151,8 +151,6 @@ run_stage = Entry(
     _TABLE,
     int,
 )
-sense_features = Entry("single:sense_features", _FLIGHT, _PARAMS, int)
-sense_gnss = Entry("single:sense_gnss", _FLIGHT, _PARAMS, bool)
 body_accelerations_in_air = Entry(
     "single:body_accelerations_in_air",
     _VECTOR,
@@ -164,8 +162,6 @@ body_accelerations_in_air = Entry(
     _VECTOR,
 )
 integrate_flight = Entry("single:integrate_flight", _FLIGHT, _PARAMS, int)
-sense_imu_average = Entry("single:sense_imu_average", _FLIGHT, _PARAMS, _FLIGHT)
-sense_imu = Entry("single:sense_imu", _FLIGHT, _PARAMS)
 body_accelerations = Entry(
     "single:body_accelerations", _MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR
 )
@@ -174,12 +170,6 @@ start_level = Entry("single:start_level", _START)
 wahba_of_vectors = Entry(
     "single:wahba_of_vectors", _VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=float
 )
-step_biases = Entry("single:step_biases", _FLIGHT, _PARAMS)
-step_gnss_drift = Entry("single:step_gnss_drift", _FLIGHT, _PARAMS)
-draw_sensor_errors = Entry("single:draw_sensor_errors", _FLIGHT, _PARAMS)
-disturb_imu = Entry("single:disturb_imu", _FLIGHT, _PARAMS)
-turn_gnss_baseline = Entry("single:turn_gnss_baseline", _FLIGHT, _PARAMS)
-limit_features = Entry("single:limit_features", _FLIGHT, _PARAMS, bool, bool, int)
 nearest_obstacles = Entry("single:nearest_obstacles", _MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
 hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MASK)
 
@@ -201,34 +191,24 @@ FILTER_ENTRIES = (
 )
 """Names of the entries that a filter calls, the slowest to compile first."""
 _SENSORS_AND_VEHICLE = (
-    sense_features,
-    sense_gnss,
+    run_stage,
     body_accelerations_in_air,
     integrate_flight,
-    sense_imu_average,
-    sense_imu,
     body_accelerations,
     start_level,
     first_heading,
     wahba_of_vectors,
-    step_biases,
-    step_gnss_drift,
-    draw_sensor_errors,
-    disturb_imu,
-    turn_gnss_baseline,
-    limit_features,
     nearest_obstacles,
     hide_points,
 )
 SENSORS_AND_VEHICLE = tuple(entry.name for entry in _SENSORS_AND_VEHICLE)
-"""Names of the entries for sensors and vehicles, the slowest to compile first."""
+"""Names of the entries for sensors and vehicles."""
 _ENTRIES = (
     fly,
     run_tape,
     start_filter,
     take_inputs,
     check_measurement,
-    run_stage,
     *_SENSORS_AND_VEHICLE,
 )
 ENTRIES = {entry.name: entry for entry in _ENTRIES}

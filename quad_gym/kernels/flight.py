@@ -165,7 +165,7 @@ _MANY = 6 * WIDTH // 8
 """Smallest number of lanes with a measurement for which a block is updated in place."""
 
 QUEUE_ORDER = (*range(2, KINDS, 2), *range(1, KINDS, 2))
-"""Sets of sensors in the order in which their waiting lanes are updated: those with GNSS last."""
+"""Sets of sensors in the order of the updates of their waiting lanes: the first sensor's last."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _plain_work_at = record_at(WORK_BLOCK)

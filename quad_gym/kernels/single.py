@@ -1,7 +1,7 @@
-"""Entries for the classes of one vehicle: scalar instances of the kernels of sensors and vehicle.
+"""Entries for the classes of one vehicle: scalar instances of the kernels of the vehicle.
 
-A filter instead runs the stages of flights on its own block, as scalar instances of these would
-take even longer to compile.
+Filters and sensors instead run the stages of flights on their own blocks, as scalar instances of
+these would take even longer to compile.
 
 Python calls them through `entries.py`, which has their arguments.
 """
@@ -13,27 +13,11 @@ from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.starts import initialize, set_heading, start_still, wahba
 from quad_gym.kernels.numbers.blocks import lanes_at, lanes_of
-from quad_gym.kernels.numbers.lanes import select
-from quad_gym.kernels.numbers.linalg import diagonal, keep, load3, load4, load33, outer, store
+from quad_gym.kernels.numbers.linalg import diagonal, load3, load4, load33, outer, store
 from quad_gym.kernels.obstacles import crosses, distance_from
-from quad_gym.kernels.sensors import camera
-from quad_gym.kernels.sensors.gnss import (
-    draw_heading_error,
-    drift_gnss,
-    measure_gnss,
-    turn_baseline,
-)
-from quad_gym.kernels.sensors.imu import (
-    draw_imu_errors,
-    drift_biases,
-    err_imu,
-    measure_imu,
-    measure_imu_average,
-    vibrate_imu,
-)
 from quad_gym.kernels.vehicle.air import accelerations_in_air
-from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT_BLOCK
+from quad_gym.kernels.vehicle.dynamics import accelerations, integrate
+from quad_gym.records import FLIGHT_BLOCK
 
 _flight_at = lanes_at(FLIGHT_BLOCK)
 
@@ -85,73 +69,6 @@ def run_stage(address, pitch, count, number, world, model, settings, work, table
         flight = _flight_at(address + index * pitch)
         scratch.mask = mask
         call_stage(table[0], number, flight, true, believed, settings[0], scratch, flag)
-
-
-@_entry
-def sense_imu(flights, params):
-    """Sample the IMU of flights[0]."""
-    measure_imu(flights[0], params[0], True)
-
-
-@_entry
-def sense_imu_average(flights, params, starts):
-    """Sample the averaging IMU of flights[0] over a tick from the true state of starts[0]."""
-    measure_imu_average(flights[0], params[0], load_state(starts[0]), True)
-
-
-@_entry
-def sense_gnss(flights, params, paired):
-    """Measure flights[0] by GNSS, including the baseline if `paired`."""
-    measure_gnss(flights[0], params[0], paired, True)
-
-
-@_entry
-def draw_sensor_errors(flights, params):
-    """Draw the constant errors of the sensors of flights[0]."""
-    draw_imu_errors(flights[0], params[0], True)
-    draw_heading_error(flights[0], params[0], True)
-
-
-@_entry
-def disturb_imu(flights, params):
-    """Add errors and vibration to the last IMU sample of flights[0]."""
-    err_imu(flights[0], params[0], True)
-    vibrate_imu(flights[0], params[0], True)
-
-
-@_entry
-def turn_gnss_baseline(flights, params):
-    """Add the constant error to the last measured baseline of flights[0]."""
-    turn_baseline(flights[0], params[0], True)
-
-
-@_entry
-def limit_features(flights, params, blurs, ground_hides, feature_count):
-    """Blur the last image of flights[0], and drop features out of range or behind the ground."""
-    camera.limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
-
-
-@_entry
-def step_gnss_drift(flights, params):
-    """Advance the slow position error of flights[0] to the next measurement."""
-    drift_gnss(flights[0], params[0], True, 1.0)
-
-
-@_entry
-def sense_features(flights, params, feature_count):
-    """Measure the features that the camera of flights[0] sees."""
-    flight = flights[0]
-    for i in range(feature_count):
-        block = FEATURE_BLOCKS + i
-        (x, y, z), seen = camera.measure(flight, params[0], i)
-        keep(flight.measurement[block], seen, (x, y, z))
-        flight.block_valid[block] = select(seen, 1.0, 0.0)
-
-
-@_entry
-def step_biases(flights, params):
-    """Advance the IMU biases of flights[0] by one tick."""
-    drift_biases(flights[0], params[0])
 
 
 @_entry

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_gym.params.sensor_table import SENSOR_SHAPES
 from quad_gym.records import (
     FIRST_AID,
     FOLLOWED,
-    Aid,
     FilterForm,
     Layout,
     Sensor,
@@ -83,19 +83,31 @@ class Stage(IntEnum):
     FEEL_GROUND = auto()
     DISTURB_IMU = auto()
     SATURATE_IMU = auto()
-    TURN_BASELINE = auto()
-    CORRUPT_GNSS = auto()
-    LIMIT_CAMERA = auto()
     HIDE_FEATURES = auto()
-    CORRUPT_FEATURES = auto()
     FORGET_INNOVATIONS = auto()
-    # sensors, last and in their order
-    GNSS = auto()
-    CAMERA = auto()
 
-    _ignore_ = "aid"
-    for aid in Aid:
-        vars()[aid.name] = auto()
+    # sensors, in their order, and the stages that these call
+    _ignore_ = "words word"
+    words = (*SENSOR_SHAPES, *(s.name for row in SENSOR_SHAPES.values() for s in row.stages))
+    for word in words:
+        vars()[word.upper()] = auto()
+
+
+STAGES_OF = {
+    "imu": (
+        Stage.KEEP_START,
+        Stage.SAMPLE,
+        Stage.AVERAGE_IMU,
+        Stage.BEGIN_IMPERFECT,
+        Stage.DISTURB_IMU,
+        Stage.DRIFT_BIASES,
+    ),
+    **{
+        name: tuple(Stage[stage.upper()] for stage in (name, *(s.name for s in row.stages)))
+        for name, row in SENSOR_SHAPES.items()
+    },
+}
+"""Stages with which a sensor measures alone, by its name."""
 
 
 class Kernel(NamedTuple):
@@ -150,20 +162,25 @@ def _formed(form: FilterForm, *names: str) -> Callable[[Any], bool]:
     return lambda settings: needed(settings) and bool(int(settings["form"]) & form)
 
 
-def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
-    return _filter_and(lambda s: s["sensor_blocks"][sensor])
-
-
-_camera = _sensor(Sensor["CAMERA"])
-
-
 def _keeps_start(s: Any) -> bool:
     return bool(s["pad"] or s["grounded"] or (s["run_filter"] and s["imu_averages"]))
 
 
-def _sensor_source(sensor: Sensor) -> Kernel:
-    name, parts = sensor.name.lower(), () if sensor < FIRST_AID else ("aids",)
-    return _stage(f"sensors.{name}:{name}", _sensor(sensor), *parts)
+def _measured(sensor: Sensor) -> Callable[[Any], bool]:
+    """Make a test of settings: a sensor measures."""
+    return _filter_and(lambda s: s["sensor_blocks"][sensor])
+
+
+def _of_sensors() -> list[Kernel]:
+    """The stages of sensors, and those that they call."""
+    found = []
+    for sensor, (name, row) in zip(Sensor, SENSOR_SHAPES.items(), strict=True):
+        parts = () if sensor < FIRST_AID else ("aids",)
+        found.append(_stage(f"sensors.{name}:{name}", _measured(sensor), *parts))
+        for further in row.stages:
+            needed = _with("run_filter", further.needed_by)
+            found.append(_stage(f"sensors.{name}:{further.name}", needed, *further.parts))
+    return found
 
 
 SOURCES = (
@@ -184,7 +201,7 @@ SOURCES = (
     _stage("filter.predict:predict", _built_in(), "filter"),
     _stage("filter.delayed:late_update_with_slow", _built_in(*_REWINDS, "slow_states"), "late"),
     _stage("filter.delayed:late_update", _built_in(*_REWINDS), "late"),
-    *map(_sensor_source, Sensor),
+    *_of_sensors(),
     _stage("sensors.imu:sample", _filter, "filter"),
     _stage("task.draws:draw", _drawn, "draws"),
     _stage("task.draws:impose", _drawn, "draws"),
@@ -203,8 +220,6 @@ SOURCES = (
     _stage("filter.starts:warm_with_slow", _with("run_filter", "slow_states", "warm")),
     _stage("filter.starts:warm", _with("run_filter", "warm")),
     _stage("sensors.imu:average_imu", _with("run_filter", "imu_averages")),
-    _stage("sensors.camera:corrupt_features", _corrupts),
-    _stage("sensors.gnss:corrupt_gnss", _corrupts),
     _stage("filter.preintegration:increment", _late, "late"),
     Kernel(Stage.LOOK, "task.observation:look_at_own", _own, ("own",)),
     _stage("task.observation:look", _always),
@@ -221,10 +236,8 @@ SOURCES = (
         "errors",
     ),
     _stage("sensors.imu:disturb_imu", _filter_and(lambda s: s["imu_errs"] or s["imu_vibrates"])),
-    _stage("sensors.gnss:turn_baseline", _with("run_filter", "heading_errs"), "errors"),
-    _stage("sensors.camera:limit_camera", _with("run_filter", "camera_limited")),
     _stage("vehicle.control:delay_action", _with("action_delays"), "actions"),
-    _stage("obstacles:hide_features", lambda s: _camera(s) and bool(s["obstacle_count"])),
+    _stage("obstacles:hide_features", _with("run_filter", "feature_count", "obstacle_count")),
     _stage("obstacles:begin_contacts", _contacts),
     _stage("obstacles:touch", _contacts, "contacts"),
     _stage("obstacles:judge_contacts", _contacts),

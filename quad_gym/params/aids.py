@@ -43,6 +43,14 @@ class FirstHeading(NamedTuple):
     slope: float = 0.0  #: error of the heading due to an unknown tilt, over that tilt
 
 
+class FurtherStage(NamedTuple):
+    """A stage that the one of a sensor calls, for an error, a limit or a fault of measurements."""
+
+    name: str  #: its function in the sensor's file of kernels, without `_stage`
+    needed_by: str  #: setting of the kernels without which it is not compiled
+    parts: tuple[str, ...] = ()  #: parts of a flight's record that it uses
+
+
 class ReadingDefinition(NamedTuple):
     """What a sensor measures: one block of numbers, or several of one kind.
 
@@ -120,6 +128,8 @@ class SensorBase(Checked):
     """Quantities of a sensor that has several, or more to say than `AidParams`."""
     words: ClassVar[str] = ""
     """The sensor in messages; empty: an article and its name, such as "a barometer\""""
+    stages: ClassVar[tuple[FurtherStage, ...]] = ()
+    """Stages besides its own one, which calls them."""
     _ideal: ClassVar[Mapping[str, Any]] = {}
     """Values without latency and without errors that the filter does not model."""
 
@@ -140,7 +150,10 @@ class SensorBase(Checked):
 
     @property
     def drift(self) -> tuple[SlowError, ...]:
-        """Slow errors that are zero at the start, and come first among the states of a filter."""
+        """Slow errors that are zero at the start, and come first among the states of a filter.
+
+        Of the sensors, one may have such errors, of three numbers.
+        """
         return ()
 
     def drift_after(self, time: float) -> tuple[float, ...]:
@@ -159,6 +172,16 @@ class SensorBase(Checked):
 
     def require_filter(self) -> None:
         """Refuse parameters with which a filter would overflow."""
+
+    @property
+    def raw_scales(self) -> tuple[float, ...]:
+        """Divisor of each of its readings in raw observations."""
+        return (1.0,) * len(self.measured_blocks)
+
+    @property
+    def raw_spans(self) -> check.Matrix:
+        """Further divisors (n, 3) of the numbers of each reading in raw observations."""
+        return ((1.0, 1.0, 1.0),) * len(self.measured_blocks)
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -287,11 +310,6 @@ class AidParams(SensorBase):
     def matrix_sigma(self) -> float:
         """Standard deviation of each scale and alignment error."""
         return 0.0
-
-    @property
-    def scale(self) -> float:
-        """Divisor that normalizes the measurement in observations."""
-        return 1.0
 
     @property
     def numbers(self) -> check.Matrix:

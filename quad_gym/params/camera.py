@@ -8,7 +8,7 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import ReadingDefinition, SensorBase
+from quad_gym.params.aids import FurtherStage, ReadingDefinition, SensorBase
 from quad_gym.params.checks import Matrix, Vector
 
 MAX_FEATURES = 16  #: largest number of a camera's features
@@ -86,12 +86,21 @@ class CameraParams(SensorBase):
         "ground_hides": False,
     }
 
+    stages: ClassVar = (
+        FurtherStage("limit_camera", "camera_limited"),
+        FurtherStage("corrupt_features", "faults"),
+    )
     reads_velocity = False
 
     @property
     def measured_blocks(self) -> tuple[int, ...]:
         """Number of features."""
         return (len(self.features_I),)
+
+    @property
+    def raw_spans(self) -> check.Matrix:
+        """Half the image's width and height [pixels]."""
+        return ((self.image_size[0] / 2, self.image_size[1] / 2, 1.0),)
 
     @property
     def packed(self) -> dict[str, Any]:

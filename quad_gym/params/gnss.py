@@ -8,7 +8,14 @@ import numpy as np
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import MIN_DRIFT, FirstHeading, ReadingDefinition, SensorBase, SlowError
+from quad_gym.params.aids import (
+    MIN_DRIFT,
+    FirstHeading,
+    FurtherStage,
+    ReadingDefinition,
+    SensorBase,
+    SlowError,
+)
 
 HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
@@ -123,6 +130,10 @@ class GnssParams(SensorBase):
     )
     _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
     words = "GNSS"
+    stages: ClassVar = (
+        FurtherStage("turn_baseline", "heading_errs", ("errors",)),
+        FurtherStage("corrupt_gnss", "faults"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,6 +207,11 @@ class GnssParams(SensorBase):
         return tuple(sigma * grown for sigma in self.drift_sigma_I) if self.drifts else ()
 
     @property
+    def raw_scales(self) -> tuple[float, ...]:
+        """The length of the baseline, which makes it a direction [m]; others are in their units."""
+        return (1.0, portable.norm(self.baseline_B) if self.has_baseline else 1.0, 1.0)
+
+    @property
     def packed(self) -> dict[str, Any]:
         """Antennas, drift between two measurements, and noise of baselines."""
         drift = SlowError(1.0, self.rate * self.drift_tau)  # in measurements
@@ -248,7 +264,7 @@ class GnssParams(SensorBase):
     @property
     def options(self) -> dict[str, bool]:
         """Drift of positions, and constant errors of baselines."""
-        return {"gnss_drifts": self.drifts, "heading_errs": self.heading_errs}
+        return {"drifts": self.drifts, "heading_errs": self.heading_errs}
 
     @property
     def heading_errs(self) -> bool:

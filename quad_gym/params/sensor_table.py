@@ -12,7 +12,13 @@ from dataclasses import field
 from typing import NamedTuple, get_args
 
 from quad_gym.params import checks as check
-from quad_gym.params.aids import OBSERVED, AidParams, ReadingDefinition, SensorBase
+from quad_gym.params.aids import (
+    OBSERVED,
+    AidParams,
+    FurtherStage,
+    ReadingDefinition,
+    SensorBase,
+)
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.checks import Checked
@@ -71,6 +77,9 @@ SENSOR_OF: dict[str, str] = {
 }
 """Sensors by the names of their readings."""
 
+DRIFTING = tuple(name for name, kind in SENSOR_PARAMS.items() if kind.drift is not SensorBase.drift)
+"""Sensors whose measurements may drift from zero at the start; see `SensorBase.drift`."""
+
 
 def in_words(sensor: str) -> str:
     """Return a sensor in messages, such as "a barometer"."""
@@ -86,6 +95,8 @@ class ReadingShape(NamedTuple):
     observes: tuple[str, ...]
     direction: bool
     least_sigma: float
+    in_G: bool
+    marked: bool
 
 
 class SensorShape(NamedTuple):
@@ -95,6 +106,7 @@ class SensorShape(NamedTuple):
     rows: int  #: triples in `AidParams.numbers`
     own_error: bool  #: True if an error of an `AidParams` is among the states of a filter
     aid: bool  #: True for an `AidParams`
+    stages: tuple[FurtherStage, ...]  #: stages besides its own one
 
 
 def _shape_of(name: str, kind: type[SensorBase]) -> SensorShape:
@@ -112,7 +124,7 @@ def _shape_of(name: str, kind: type[SensorBase]) -> SensorShape:
         for word in reading.observes:
             check.choice(f"{kind.__name__}.observes", word, OBSERVED)
         shapes.append(ReadingShape(*(getattr(reading, word) for word in ReadingShape._fields)))
-    return SensorShape(tuple(shapes), rows, own_error, aid)
+    return SensorShape(tuple(shapes), rows, own_error, aid, kind.stages)
 
 
 def _require_complete(kind: type[AidParams]) -> None:

@@ -238,6 +238,24 @@ class SensorSuite(SensorTable, Saved):
         return corrected and self.optical_flow is not None and not places
 
     @property
+    def has_fixes(self) -> bool:
+        """True if GNSS measures positions; a filter without them uses all features of images."""
+        return self.blocks_of("gnss_position") > 0
+
+    @property
+    def heading_by_motion(self) -> int:
+        """1 if the filter compares its heading with the motion, by GNSS velocities; 0: it does not.
+
+        With a baseline or a camera, which measure the heading better, it is 2: the motion only
+        shows a heading that is unknown. Without GNSS velocities or a gate it is 0.
+        """
+        gates = self.estimator.false_alarm_probability > 0.0
+        if not gates or not self.blocks_of("gnss_velocity"):
+            return 0
+        directions = (name for name, reading in READINGS.items() if reading.direction)
+        return 2 if any(map(self.blocks_of, directions)) else 1
+
+    @property
     def drifts(self) -> bool:
         """True if positions have a time-correlated error, which the filter estimates."""
         return any(sensor.drift for sensor in self.sensors.values())

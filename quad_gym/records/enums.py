@@ -94,6 +94,10 @@ DIRECTIONS = tuple(shape.direction for shape in _SHAPES)
 """True for readings that filters compare as unit vectors, of three numbers."""
 GROUP_FREEDOMS = tuple(2 if shape.direction else shape.length for shape in _SHAPES)
 """Degrees of freedom of a block of each reading: a direction has two."""
+IN_G = tuple(int(shape.in_G) for shape in _SHAPES)
+"""1 for readings that records have in G, the frame of GNSS, in place of I."""
+MARKED = tuple(int(shape.marked) for shape in _SHAPES)
+"""1 for readings that the mark of a start gives where no sensor does."""
 GROUP_COUNT = tuple(len(sensor.readings) for sensor in _SENSOR_SHAPES)
 """Number of readings of each sensor, each a group of the gate."""
 

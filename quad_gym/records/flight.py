@@ -134,7 +134,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         # slow errors and clocks of the sensors
         Field("b_a", (3,), "m/s^2", "accelerometer bias"),
         Field("b_g", (3,), "rad/s", "gyro bias"),
-        Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
+        Field("drift", (3,), "m", "drift of a sensor's measurements: of GNSS positions, in I"),
         Field("wait", (SENSORS,), "ticks", "time until the next measurement of each sensor"),
         Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "1 if a block of the measurement has arrived since the last step"),
         # the batches that a snapshot fits

@@ -108,9 +108,9 @@ from scripts import mutants, mutants_of_kernels as broken
 from quad_gym.estimation import solve_wahba
 from quad_gym.kernels.filter.starts import wahba
 
-wahba_of_vectors, step_biases = entries = [
+wahba_of_vectors, integrate_flight = entries = [
     broken.dispatcher_of(f"quad_gym.kernels.single:{name}")
-    for name in ("wahba_of_vectors", "step_biases")
+    for name in ("wahba_of_vectors", "integrate_flight")
 ]
 broken.keep_in_memory()
 kernels = broken.Kernels([f"quad_gym.kernels.single:{e.__name__}" for e in entries])
@@ -124,7 +124,7 @@ file = mutants.ROOT / "quad_gym/kernels/filter/starts.py"
 text = file.read_text()
 change = lambda before, after: kernels.change(file, text, text.replace(before, after))
 change("select(zeta < 0.0, -1.0, 1.0) /", "select(zeta < 0.0, -1.0, 1.0) *")
-assert not wahba_of_vectors.overloads and step_biases.overloads
+assert not wahba_of_vectors.overloads and integrate_flight.overloads
 assert known == list(wahba.overloads.values())  # its caller is not translated again
 assert not np.allclose(solve(), turn, atol=1e-3)
 try:

@@ -56,7 +56,7 @@ def test_joint_error_of_state_and_slow_errors_matches_warm_start_covariance():
     places = slow_states(sensors)
     vector, errors = places.vectors[Aid.MAGNETOMETER], np.zeros((flights, 9))
     hat = batch.record("slow_hat")
-    errors[:, :3] = batch.record("gnss_drift") - hat[:, :3]
+    errors[:, :3] = batch.record("drift") - hat[:, :3]
     iron = batch.record("aid_vector")[:, Aid.MAGNETOMETER]
     errors[:, vector : vector + 3] = iron - hat[:, vector : vector + 3]
     for aid in Aid:

@@ -43,5 +43,5 @@ def test_catalog_has_the_entries_of_kernels_with_their_arguments():
     ],
 )
 def test_array_of_wrong_layout_or_type_raises_type_error(flights, words):
-    with pytest.raises(TypeError, match=f"step_biases takes an array .*{words}"):
-        entries.step_biases(flights, np.zeros(1, PARAMS))
+    with pytest.raises(TypeError, match=f"integrate_flight takes an array .*{words}"):
+        entries.integrate_flight(flights, np.zeros(1, PARAMS), 1)

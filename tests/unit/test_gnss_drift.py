@@ -20,7 +20,7 @@ def test_drift_in_one_axis_leaves_other_axes_without_drift():
     batch = fly(suite, 50, task="hover")
     steps(batch, 5.0)
     assert not batch.record("filter_status").any()
-    drift = batch.record("gnss_drift_hat")
+    drift = batch.record("drift_hat")
     assert (abs(drift[:, 1:]) < 1e-5).all()
     assert abs(drift[:, 0]).max() > 0.1
 
@@ -42,8 +42,8 @@ def test_filter_with_gnss_drift_is_consistent(kind, start, latency):
 def test_warm_start_draws_the_drift_of_a_running_receiver():
     """The drift has its variance after 10 s, and the joint errors match the filter's covariance."""
     batch = fly(CONSUMER, 4000, task="hover", filter_start="warm")
-    true = batch.record("gnss_drift")
-    error = true - batch.record("gnss_drift_hat")
+    true = batch.record("drift")
+    error = true - batch.record("drift_hat")
     expected = np.array(CONSUMER.gnss.drift_sigma_I) * np.sqrt(1 - np.exp(-20.0 / 60.0))
     np.testing.assert_allclose(true.std(axis=0), expected, rtol=0.06)
     L = np.zeros((4000, 18, 18))
@@ -52,8 +52,8 @@ def test_warm_start_draws_the_drift_of_a_running_receiver():
     white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0]
     np.testing.assert_allclose(np.cov(white.T), np.eye(18), atol=0.1)
     # an estimate is independent of its error
-    correlation = (batch.record("gnss_drift_hat") * error).mean(axis=0) / error.std(axis=0)
-    assert (abs(correlation / batch.record("gnss_drift_hat").std(axis=0)) < 0.08).all()
+    correlation = (batch.record("drift_hat") * error).mean(axis=0) / error.std(axis=0)
+    assert (abs(correlation / batch.record("drift_hat").std(axis=0)) < 0.08).all()
 
 
 def test_a_gross_outlier_is_rejected():
@@ -96,9 +96,9 @@ def test_drift_grows_over_the_time_from_the_start_to_the_first_measurement(phase
         rate=2.0, phase=phase, drift_sigma_I=(1.0, 2.0, 3.0), drift_tau=0.5, latency=0.0
     )
     batch, measured = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover"), 0.5 * phase
-    np.testing.assert_array_equal(batch.record("gnss_drift"), 0.0)
+    np.testing.assert_array_equal(batch.record("drift"), 0.0)
     for wait in (measured + 0.02, 0.5):
         steps(batch, round(50.0 * wait) / 50.0)
         expected = np.array([1.0, 2.0, 3.0]) * np.sqrt(1.0 - np.exp(-2.0 * measured / 0.5))
-        np.testing.assert_allclose(batch.record("gnss_drift").std(axis=0), expected, rtol=0.06)
+        np.testing.assert_allclose(batch.record("drift").std(axis=0), expected, rtol=0.06)
         measured += 0.5

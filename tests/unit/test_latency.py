@@ -82,7 +82,7 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
         setattr(start, name, batch.record(f"{name}_hat")[0])
     start.P = batch.covariance()[0]
     if suite.drifts:
-        start.d = batch.record("gnss_drift_hat")[0]
+        start.d = batch.record("drift_hat")[0]
         start.P = block_diag(start.P, 1e-20 * np.eye(3))
     reference = Rewinding(start)
     waits = [round(s.latency / DT) if s is not None else 0 for s in (suite.gnss, suite.camera)]
@@ -106,7 +106,7 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
             parts.insert(2, small_euler_angles(batch.record("R_hat") @ there.R.T)[0])
             P = batch.covariance()[0]
             if suite.drifts:
-                parts.append(batch.record("gnss_drift_hat")[0] - there.d)
+                parts.append(batch.record("drift_hat")[0] - there.d)
                 L = np.vstack([np.pad(batch.record("L")[0], ((0, 0), (0, 3))),
                                batch.record("L_drift")[0]])  # fmt: skip
                 P = L @ L.T

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 import quad_gym.kernels
 from quad_gym.faults import GnssJump, GnssOutage
-from quad_gym.kernels.entries import sense_features, sense_gnss, sense_imu, step_biases
-from quad_gym.packing import params_record
+from quad_gym.kernels.entries import linked_table, run_stage
+from quad_gym.kernels.stages import STAGES_OF, Stage, needed_stages
+from quad_gym.packing import params_block, params_record, sensor_settings
 from quad_gym.params.randomization import Normal, Uniform
 from quad_gym.params.task import TaskParams
 from quad_gym.records import (
@@ -26,12 +27,16 @@ from quad_gym.records import (
     DRAWS_OF_FAULT,
     FAULT_KINDS,
     FEATURE_SLICE,
-    FLIGHT,
+    FLIGHT_BLOCK,
     MAX_FEATURES,
     MAX_OBSTACLES,
     MAX_SLOW,
     POSITION_BLOCK,
+    WIDTH,
+    WORK_BLOCK,
+    Act,
     FaultKind,
+    aligned_zeros,
     streams,
 )
 from quad_gym.records.streams import _claim
@@ -256,21 +261,25 @@ def readings():
     features = [(10.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (-2.0, 0.0, 1.0, 2.0)]
     camera = quad_gym.CameraParams(attitude=np.radians((90.0, 0.0, 90.0)), features_I=features)
     suite = quad_gym.SensorSuite(camera=camera)
-    flight, params = np.zeros(1, FLIGHT), params_record(quad_gym.VehicleParams(), suite)
-    flight["q"], flight["key"] = (1.0, 0.0, 0.0, 0.0), (12, 34)
+    params = params_block(params_record(quad_gym.VehicleParams(), suite))
+    settings, work = sensor_settings(suite), aligned_zeros(1, WORK_BLOCK)
+    needed, used = needed_stages(settings[0]), ("imu", "gnss", "camera")
+    stages = {s: needed[s] for name in used for s in STAGES_OF[name] if s in needed}
+    others = (params, params, settings, work, linked_table(stages, (run_stage.name,)))
+    flight = aligned_zeros(1, FLIGHT_BLOCK)
+    flight["q"][0, 0], flight["key"][0], work["mask"] = 1.0, [[12], [34]], 1.0
     rows = []
-    for instant in range(INSTANTS):
-        flight["instant"], flight["b_a"], flight["b_g"] = instant, 0.0, 0.0
-        sense_imu(flight, params)
-        sense_gnss(flight, params, True)
-        sense_features(flight, params, len(features))
-        step_biases(flight, params)
+    for first in range(0, INSTANTS, WIDTH):
+        flight["instant"], flight["b_a"], flight["b_g"] = first + np.arange(WIDTH), 0.0, 0.0
+        for stage in (Stage.SAMPLE, Stage["GNSS"], Stage["CAMERA"], Stage.DRIFT_BIASES):
+            flag = Act.SAMPLE if stage.name.lower() in used else 0
+            run_stage(flight.ctypes.data, 0, 1, stage, *others, flag)
         z = flight["measurement"][0]
         fix = [z[POSITION_BLOCK], z[BASELINE_BLOCK]]
         numbers = [*(flight[name][0] for name in ("accel", "gyro", "b_a", "b_g")), *fix]
-        rows.append(np.concatenate([*numbers, z[FEATURE_SLICE, :2].ravel()]))
-    assert flight["block_valid"][:, FEATURE_SLICE].sum() == len(features)
-    noise = np.array(rows)
+        rows.append(np.concatenate([*numbers, *z[FEATURE_SLICE, :2]]).T)
+    assert flight["block_valid"][0, FEATURE_SLICE].sum() == WIDTH * len(features)
+    noise = np.concatenate(rows)
     return (noise - noise.mean(axis=0)) / noise.std(axis=0)
 
 

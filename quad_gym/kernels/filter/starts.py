@@ -555,7 +555,7 @@ def _start_warm(flight, p, work, settings, stages, slow):
         if slow.estimates_drift:
             s = load3(settings.warm_drift_sigma)
             true = T @ (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2])
-            keep(flight.gnss_drift, mask, true)
+            keep(flight.drift, mask, true)
             keep(flight.slow_hat, mask, true - T @ load3(d[D : D + 3]))
         _start_aids(flight, slow, T, d, mask)
 

@@ -76,7 +76,7 @@ def project(X_I, r_I, R_BI, p):
 
 
 @kernel
-def measure(flight, p, i):
+def _measure(flight, p, i):
     """The projection of feature i, and the lanes in which it is visible."""
     R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
     x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
@@ -190,7 +190,7 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
 camera_stage = sensor_stage(
     Sensor["CAMERA"],
     _begin,
-    sample_of(Sensor["CAMERA"], measure, _when, change=_change),
+    sample_of(Sensor["CAMERA"], _measure, _when, change=_change),
     ReadingModel(_expect, _reset),
 )
 
@@ -203,35 +203,28 @@ HIDDEN_BELOW = 1e-3
 """Depth below the ground at which a feature is hidden [m]: one on the ground is visible."""
 
 
-@kernel
-def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
-    """Blur the image just taken; drop features too far or behind the ground, where `mask`."""
-    stream, r_I = stream_of(flight), load3(flight.r)
+@stage
+def limit_camera_stage(flight, world, model, settings, work, stages, flag):
+    """Blur the image just taken; drop features too far or behind the ground."""
+    p, mask, stream, r_I = world, work.mask > 0.0, stream_of(flight), load3(flight.r)
     camera_I = r_I + quaternion_to_dcm(load4(flight.q)).T @ load3(p.camera)
     # uniform over the smear in both directions: sqrt(3) standard deviations
     reach = 1.7320508075688772 * p.blur * norm(load3(flight.w))
-    for i in range(feature_count):
+    for i in range(settings.feature_count):
         X_I, valid = load3(p.features[i]), flight.block_valid[FEATURE_BLOCKS + i]
         lost = norm(X_I - camera_I) > p.max_range
-        if ground_hides:
+        if settings.ground_hides:
             below = logical_not(camera_I[2] >= p.ground_height)
             lost = lost | below | (X_I[2] < p.ground_height - HIDDEN_BELOW)
         kept = select(lost, 0.0, valid)
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, kept, valid)
         seen = mask & (kept > 0.0)
-        if blurs and any_of(seen):
+        if settings.camera_blurs and any_of(seen):
             u, v = uniform_pair(stream, DRAW_BLUR + i)
             for axis in range(2):
                 shift = reach * (2.0 * (u if axis == 0 else v) - 1.0)
                 pixel = flight.measurement[FEATURE_BLOCKS + i, axis]
                 flight.measurement[FEATURE_BLOCKS + i, axis] = select(seen, pixel + shift, pixel)
-
-
-@stage
-def limit_camera_stage(flight, world, model, settings, work, stages, flag):
-    """Blur the image just taken; drop features too far or behind the ground."""
-    count, mask = settings.feature_count, work.mask > 0.0
-    limit_camera(flight, world, settings.camera_blurs, settings.ground_hides, count, mask)
 
 
 @kernel

@@ -51,6 +51,7 @@ from quad_gym.records import (
     DRAW_HEADING,
     DRAW_PHASE,
     DRAW_VELOCITY,
+    FIRST_GROUP,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     FaultKind,
@@ -76,22 +77,22 @@ def measure_position(flight, p, R_BI, normals, mask):
     s = load3(p.position_sigma_I)
     antenna_I = load3(flight.r) + R_BI.T @ load3(p.antenna)
     noise_I = vector(s[0] * normals[0], s[1] * normals[1], s[2] * normals[2])
-    noise_I = noise_I + load3(flight.gnss_drift)
+    noise_I = noise_I + load3(flight.drift)
     keep(flight.measurement[POSITION_BLOCK], mask, load33(p.R_IG).T @ (antenna_I + noise_I))
 
 
 @kernel
-def drift_gnss(flight, p, mask, share):
+def _drift(flight, p, mask, share):
     """Advance the slow error of GNSS positions to the next measurement, in the lanes `mask`.
 
     The first measurement comes a `share` of the period after the start.
     """
     n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
-    d, s, x = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_step
+    d, s, x = load3(flight.drift), load3(p.drift_drive), p.drift_step
     decay = exp(-share * x)
     root = math.sqrt(approached(2.0 * share * x) / approached(2.0 * x))
     drive = vector(root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
-    keep(flight.gnss_drift, mask, decay * d + rounded(drive))
+    keep(flight.drift, mask, decay * d + rounded(drive))
 
 
 @kernel
@@ -254,26 +255,21 @@ def reset_velocity(flight, p, work, settings, states, lanes, alone, nu):
 
 
 @kernel
-def draw_heading_error(flight, p, mask):
+def _draw_heading_error(flight, p, mask):
     """Draw the constant error of an episode's baselines, where `mask`."""
     n, _ = normal_pair(stream_of(flight), DRAW_HEADING)
     flight.heading_error = select(mask, p.heading_error_sigma * n, flight.heading_error)
 
 
-@kernel
-def turn_baseline(flight, p, mask):
-    """Turn a measured baseline about the body z axis by its constant error, where `mask`."""
-    z_G = load33(p.R_IG).T @ quaternion_to_dcm(load4(flight.q))[2]
+@stage
+def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
+    """Turn the baseline just measured about the body z axis by its constant error."""
+    z_G = load33(world.R_IG).T @ quaternion_to_dcm(load4(flight.q))[2]
     s, c = sin_cos(flight.heading_error)
     b = load3(flight.measurement[BASELINE_BLOCK])
     turned = c * b + rounded(s * cross(z_G, b))
-    keep(flight.measurement[BASELINE_BLOCK], mask, (1.0 - c) * dot(z_G, b) * z_G + turned)
-
-
-@stage
-def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
-    """Apply the constant error to the baseline just measured."""
-    turn_baseline(flight, world, work.mask > 0.0)
+    turned = (1.0 - c) * dot(z_G, b) * z_G + turned
+    keep(flight.measurement[BASELINE_BLOCK], work.mask > 0.0, turned)
 
 
 @kernel
@@ -336,36 +332,31 @@ def corrupt_gnss_stage(flight, world, model, settings, work, stages, flag):
 
 _GNSS = int(Sensor["GNSS"])
 _BLOCKS = (POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK)
+_BASELINE, _VELOCITY = FIRST_GROUP[_GNSS] + 1, FIRST_GROUP[_GNSS] + 2  #: groups of these readings
 
 
 @kernel
 def _begin(flight, p, settings, mask):
     share, _ = uniform_pair(stream_of(flight), DRAW_PHASE)
     begin_clock(flight, settings, _GNSS, share, mask)
-    keep(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    keep(flight.drift, mask, (0.0, 0.0, 0.0))
     if settings.heading_errs:
-        draw_heading_error(flight, p, mask)
-
-
-@kernel
-def measure_gnss(flight, p, paired, mask):
-    """Measure the antenna's position and, if `paired`, the baseline, in G, in the lanes `mask`."""
-    R_BI = quaternion_to_dcm(load4(flight.q))
-    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
-    measure_position(flight, p, R_BI, n_p, mask)
-    if paired:
-        measure_baseline(flight, p, R_BI, n_b, mask)
+        _draw_heading_error(flight, p, mask)
 
 
 @kernel
 def _measure(flight, p, settings, work, stages, mask, corrupted):
     """Measure, with constant heading error and, if `corrupted`, faults, in the lanes `mask`."""
-    measure_gnss(flight, p, settings.gnss_baseline > 0, mask)
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
+    measure_position(flight, p, R_BI, n_p, mask)
+    if settings.reading_blocks[_BASELINE] > 0:
+        measure_baseline(flight, p, R_BI, n_b, mask)
     work.mask = select(mask, 1.0, 0.0)
     call_stage(stages, Stage.TURN_BASELINE, flight, p, p, settings, work, 0)
     if corrupted:
         call_stage(stages, Stage.CORRUPT_GNSS, flight, p, p, settings, work, 0)
-    if settings.gnss_velocity > 0:
+    if settings.reading_blocks[_VELOCITY] > 0:
         measure_velocity(flight, p, mask)
 
 
@@ -374,7 +365,7 @@ def _flag(flags, mask, position, baseline, settings):
     """Set the flags of the three blocks, in the lanes `mask`."""
     flags[POSITION_BLOCK] = select(mask, position, flags[POSITION_BLOCK])
     flags[BASELINE_BLOCK] = select(mask, baseline, flags[BASELINE_BLOCK])
-    if settings.gnss_velocity > 0:
+    if settings.reading_blocks[_VELOCITY] > 0:
         flags[VELOCITY_BLOCK] = select(mask, position, flags[VELOCITY_BLOCK])
 
 
@@ -387,9 +378,9 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
         return
-    if settings.gnss_drifts > 0 and not starting and any_of(due):
+    if settings.drifts > 0 and not starting and any_of(due):
         share = minimum(flight.tick / period, 1.0)
-        drift_gnss(flight, p, due, share)
+        _drift(flight, p, due, share)
     measured = mask if starting else due
     paired = measured
     initializes = starting and not settings.warm  # this fix has no faults
@@ -397,7 +388,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         measured, paired = _heard(flight, settings, due)
     if any_of(measured):
         _measure(flight, p, settings, work, stages, measured, not initializes)
-    if settings.gnss_baseline == 0:
+    if settings.reading_blocks[_BASELINE] == 0:
         paired = paired & logical_not(measured)
     unpaired = measured & logical_not(paired)
     if starting or not delayed:

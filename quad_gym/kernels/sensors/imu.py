@@ -26,15 +26,6 @@ from quad_gym.records import DRAW_BIAS, DRAW_IMU, DRAW_IMU_ERRORS, DRAW_VIBRATIO
 
 
 @kernel
-def drift_biases(flight, p):
-    """Step the Gauss-Markov biases by one tick: b+ = alpha b + v_2 (report equations 6 and 7)."""
-    n_a, n_g = six_normals(stream_of(flight), DRAW_BIAS)
-    for i in range(3):
-        flight.b_a[i] = p.accel_bias_decay * flight.b_a[i] + p.accel_bias_drive * n_a[i]
-        flight.b_g[i] = p.gyro_bias_decay * flight.b_g[i] + p.gyro_bias_drive * n_g[i]
-
-
-@kernel
 def specific_force(flight, p, R_BI):
     """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
     a_I, dw_B = air_accelerations(flight, p, R_BI)
@@ -60,14 +51,14 @@ def _sample_imu(flight, p, w_B, f_B, mask):
 
 
 @kernel
-def measure_imu(flight, p, mask):
+def _measure_now(flight, p, mask):
     """Sample accelerometer and gyro at this instant, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     _sample_imu(flight, p, load3(flight.w), specific_force(flight, p, R_BI), mask)
 
 
 @kernel
-def measure_imu_average(flight, p, start, mask):
+def _measure_average(flight, p, start, mask):
     """Sample the means of body rates and specific force over the tick that ends now, where `mask`.
 
     Model of an IMU that integrates faster than it reports: the mean rate is the rotation vector
@@ -93,7 +84,7 @@ def sample_stage(flight, world, model, settings, work, stages, flag):
     if flag == 0 and settings.imu_averages:  # at the start, no tick to average over
         return
     mask = work.mask > 0.0
-    measure_imu(flight, world, mask)
+    _measure_now(flight, world, mask)
     call_stage(stages, Stage.FEEL_GROUND, flight, world, world, settings, work, 0)
     call_stage(stages, Stage.DISTURB_IMU, flight, world, world, settings, work, 0)
     if flag > 0:
@@ -103,14 +94,17 @@ def sample_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def drift_biases_stage(flight, world, model, settings, work, stages, flag):
-    """Let the true IMU biases drift over a tick."""
-    drift_biases(flight, world)
+    """Step the Gauss-Markov biases by one tick: b+ = alpha b + v_2 (report equations 6 and 7)."""
+    n_a, n_g = six_normals(stream_of(flight), DRAW_BIAS)
+    for i in range(3):
+        flight.b_a[i] = world.accel_bias_decay * flight.b_a[i] + world.accel_bias_drive * n_a[i]
+        flight.b_g[i] = world.gyro_bias_decay * flight.b_g[i] + world.gyro_bias_drive * n_g[i]
 
 
 @stage
 def average_imu_stage(flight, world, model, settings, work, stages, flag):
     """Sample the means of the IMU over the tick that ends now."""
-    measure_imu_average(flight, world, load_start(work), work.mask > 0.0)
+    _measure_average(flight, world, load_start(work), work.mask > 0.0)
     call_stage(stages, Stage.DISTURB_IMU, flight, world, model, settings, work, 0)
     call_stage(stages, Stage.SATURATE_IMU, flight, world, model, settings, work, 0)
 
@@ -141,20 +135,7 @@ def _errors(on, off, n, m, k):
 
 
 @kernel
-def draw_imu_errors(flight, p, mask):
-    """Draw the errors of scale and alignment of an episode, where `mask`."""
-    stream = stream_of(flight)
-    a, b = six_normals(stream, DRAW_IMU_ERRORS)
-    c, d = six_normals(stream, DRAW_IMU_ERRORS + 3)
-    e, f = six_normals(stream, DRAW_IMU_ERRORS + 6)
-    accel = _errors(p.accel_scale_sigma, p.accel_misalignment_sigma, a, b, c)
-    gyro = _errors(p.gyro_scale_sigma, p.gyro_misalignment_sigma, d, e, f)
-    keep(flight.accel_error, mask, accel)
-    keep(flight.gyro_error, mask, gyro)
-
-
-@kernel
-def err_imu(flight, p, mask):
+def _err(flight, p, mask):
     """Add D (f - g e3) and D w to the IMU's sample, where `mask`."""
     D_a, D_g = load33(flight.accel_error), load33(flight.gyro_error)
     f, w, w_now = load3(flight.accel), load3(flight.gyro), load3(flight.w_meas)
@@ -164,7 +145,7 @@ def err_imu(flight, p, mask):
 
 
 @kernel
-def vibrate_imu(flight, p, mask):
+def _vibrate(flight, p, mask):
     """Add the rotors' vibration to the IMU's sample, where `mask`.
 
     Each rotor's imbalance shakes with a force that grows with the square of its speed, and the four
@@ -182,17 +163,24 @@ def vibrate_imu(flight, p, mask):
 
 @stage
 def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
-    """Draw the errors that last an episode."""
-    draw_imu_errors(flight, world, work.mask > 0.0)
+    """Draw the errors of scale and alignment of an episode."""
+    p, mask, stream = world, work.mask > 0.0, stream_of(flight)
+    a, b = six_normals(stream, DRAW_IMU_ERRORS)
+    c, d = six_normals(stream, DRAW_IMU_ERRORS + 3)
+    e, f = six_normals(stream, DRAW_IMU_ERRORS + 6)
+    accel = _errors(p.accel_scale_sigma, p.accel_misalignment_sigma, a, b, c)
+    gyro = _errors(p.gyro_scale_sigma, p.gyro_misalignment_sigma, d, e, f)
+    keep(flight.accel_error, mask, accel)
+    keep(flight.gyro_error, mask, gyro)
 
 
 @stage
 def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
     """Add the IMU's constant errors and vibration to its sample."""
     if settings.imu_errs:
-        err_imu(flight, world, work.mask > 0.0)
+        _err(flight, world, work.mask > 0.0)
     if settings.imu_vibrates:
-        vibrate_imu(flight, world, work.mask > 0.0)
+        _vibrate(flight, world, work.mask > 0.0)
 
 
 @stage

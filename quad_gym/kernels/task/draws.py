@@ -17,6 +17,7 @@ from quad_gym.kernels.numbers.linalg import keep, load3, load33, norm, store, ve
 from quad_gym.kernels.numbers.random import stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import euler_to_dcm
 from quad_gym.records import (
+    BASELINE_BLOCK,
     COLUMNS,
     DRAW_PARAMETERS,
     DRAWN_SIZE,
@@ -146,6 +147,7 @@ def _derive_sensors(own, nominal, settings):
         own.imu_lever_arm[i] = own.lever_arm_B[i] - center
         own.camera[i] = own.camera_position_B[i] - center
     own.baseline_length = norm(load3(own.baseline))
+    own.raw_scale[BASELINE_BLOCK] = own.baseline_length  # the group has the number of its block
     k, kinds = _CAMERA_ROTATION, settings.draw_kind
     if kinds[k] != FIXED or kinds[k + 1] != FIXED or kinds[k + 2] != FIXED:
         store(own.R_CB, euler_to_dcm(load3(own.camera_rotation)) @ load33(nominal.R_CB))

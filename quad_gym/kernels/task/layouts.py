@@ -9,18 +9,15 @@ from quad_gym.kernels.numbers.linalg import load3, load4, load33
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.records import (
-    AID_BLOCK,
-    AID_FREEDOMS,
-    AIDS,
-    BASELINE_BLOCK,
     DRAWN_SIZE,
-    FEATURE_BLOCKS,
-    FIRST_AID,
     FIXED,
     FOLLOWED,
+    GROUP_BLOCK,
+    IN_G,
+    LENGTHS,
+    MARKED,
     MAX_GATES,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
+    SENSOR_GROUPS,
     Source,
     TaskKind,
 )
@@ -101,37 +98,22 @@ def put_absolute(flight, p, settings, row):
 
 
 @kernel
-def _put_gnss(flight, row, k, R_IG, block, scale):
-    """Write a reading of GNSS since the last step in I, over a scale, and a flag, or zeros."""
-    fresh = flight.block_fresh[block]
-    k = _put3(row, k, (fresh / scale) * (R_IG @ load3(flight.measurement[block])))
-    row[k] = fresh
-    return k + 1
+def _put_readings(flight, p, settings, row, k):
+    """Write the sensors' readings since the last step, over their units, and flags, or zeros.
 
-
-@kernel
-def _put_features(flight, p, settings, row, k):
-    """Write pixels of features since the last step, over half the image, and flags, or zeros."""
-    for i in range(settings.feature_count):
-        fresh = flight.block_fresh[FEATURE_BLOCKS + i]
-        row[k] = fresh * flight.measurement[FEATURE_BLOCKS + i, 0] / p.half_image[0]
-        row[k + 1] = fresh * flight.measurement[FEATURE_BLOCKS + i, 1] / p.half_image[1]
-        row[k + 2] = fresh
-        k += 3
-    return k
-
-
-@kernel
-def _put_aids(flight, p, settings, row, k):
-    """Write readings of the other sensors since the last step, over their scales, and flags."""
-    for s in range(AIDS):
-        for block in range(settings.sensor_blocks[FIRST_AID + s]):
-            fresh = flight.block_fresh[AID_BLOCK[s] + block]
-            scaled = fresh / p.aid_scale[s]
-            for i in range(AID_FREEDOMS[s]):
-                row[k + i] = scaled * flight.measurement[AID_BLOCK[s] + block, i]
-            row[k + AID_FREEDOMS[s]] = fresh
-            k += AID_FREEDOMS[s] + 1
+    Readings that a mark may give have their place also where a suite lacks them.
+    """
+    R_IG = load33(p.R_IG)
+    for g in range(SENSOR_GROUPS):
+        first, count = GROUP_BLOCK[g], max(settings.reading_blocks[g], MARKED[g])
+        for block in range(first, first + count):
+            z, fresh, span = load3(flight.measurement[block]), flight.block_fresh[block], p.raw_span
+            if IN_G[g] > 0:
+                z = R_IG @ z
+            z = (fresh / p.raw_scale[g]) * z
+            _put3(row, k, (z[0] / span[g, 0], z[1] / span[g, 1], z[2] / span[g, 2]))
+            row[k + LENGTHS[g]] = fresh
+            k += LENGTHS[g] + 1
     return k
 
 
@@ -142,19 +124,13 @@ def put_sensors(flight, p, settings, row):
     The IMU contributes its last sample and the mean of all samples since the last step (a single
     sample at the start of an episode).
     """
-    R_IG = load33(p.R_IG)
     gyro, accel = load3(flight.gyro), load3(flight.accel)
     k = _put3(row, 0, gyro)
     k = _put3(row, k, accel)
     starts, share = flight.tick == 0.0, 1.0 / settings.ticks_per_step
     k = _put3(row, k, select(starts, gyro, share * load3(flight.gyro_sum)))
     k = _put3(row, k, select(starts, accel, share * load3(flight.accel_sum)))
-    k = _put_gnss(flight, row, k, R_IG, POSITION_BLOCK, 1.0)
-    k = _put_gnss(flight, row, k, R_IG, BASELINE_BLOCK, p.baseline_length)
-    if settings.gnss_velocity > 0:  # measured with every position
-        k = _put_gnss(flight, row, k, R_IG, VELOCITY_BLOCK, 1.0)
-    k = _put_features(flight, p, settings, row, k)
-    k = _put_aids(flight, p, settings, row, k)
+    k = _put_readings(flight, p, settings, row, k)
     return _put_reference(flight, p, settings, row, k)
 
 
