@@ -7,7 +7,7 @@ import os
 import zipfile
 import zlib
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,7 +21,8 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.packing import params_record
 from quad_gym.params import checks as check
-from quad_gym.params.sensor_table import READINGS, SENSOR_OF
+from quad_gym.params.aids import ReadingDefinition
+from quad_gym.params.sensor_table import READINGS, SENSOR_PARAMS
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import BLOCKS_OF, Source
 from quad_gym.rotations import quaternion_to_dcm
@@ -39,16 +40,42 @@ class Column(NamedTuple):
     """One quantity of a flight."""
 
     name: str
-    shape: tuple[int, ...]  #: shape of one row; FEATURES stands for the camera's number of features
+    shape: tuple[int | str, ...]  #: shape of one row; a word: as many as there are of these
     unit: str
     frame: str  #: I: inertial (east, north, up), B: body, C: image; "-": none
     meaning: str
+    several: str = ""  #: the reading whose blocks it has as rows; empty: none
+    labels: tuple[str, ...] = ()
+    """suffixes of its numbers in a table; empty: of axes, or numbers"""
 
 
-FEATURES = -1
+def _decision(sensor: str) -> Column:
+    """The gate's decisions on the readings of a sensor, or on the blocks of its only one."""
+    reading, *others = readings = SENSOR_PARAMS[sensor].readings(sensor)
+    if others:
+        labels = tuple(each.label for each in readings)
+        words = f"gate decisions on {', '.join(labels[:-1])} and {labels[-1]}, see `GateDecision`"
+        name, shape = f"{sensor}_decision", (len(labels),)
+        return Column(name, shape, "-", "-", f"{words}; 0: no gate", labels=labels)
+    one = reading.block or reading.name
+    if reading.most_blocks == 1:
+        about = f"gate decision on `{one}`, see `GateDecision`"
+        return Column(f"{one}_decision", (), "-", "-", about)
+    about = f"gate decision on each {reading.block or 'block'}, see `GateDecision`"
+    return Column(f"{one}_decision", reading.dimensions[:1], "-", "-", about, reading.name)
 
-FIXES = tuple(name for name in READINGS if SENSOR_OF[name] == "gnss")
-"""Readings with a decision in `gnss_decision`, in its order."""
+
+_DECISIONS = {sensor: _decision(sensor) for sensor in SENSOR_PARAMS}
+"""Columns of the gate's decisions, by sensor."""
+
+
+def _of_sensors() -> list[str | Column]:
+    """The readings of each sensor, followed by the gate's decisions on them."""
+    found: list[str | Column] = []
+    for sensor, kind in SENSOR_PARAMS.items():
+        found += [*(reading.name for reading in kind.readings(sensor)), _DECISIONS[sensor]]
+    return found
+
 
 # fmt: off
 _ROWS: tuple[str | Column, ...] = (
@@ -66,10 +93,8 @@ _ROWS: tuple[str | Column, ...] = (
     # the state that the controller observed
     "observed_position", "observed_quaternion",
     # the latest measurements since the previous row
-    "gyro", "accel", *FIXES,
-    Column("gnss_decision", (3,), "-", "-", "gate decisions on position, baseline and velocity, see `GateDecision`; 0: no gate"),
-    "pixels",
-    Column("feature_decision", (FEATURES,), "-", "-", "gate decision on each feature, see `GateDecision`"),
+    "gyro", "accel",
+    *_of_sensors(),
     # the task: the action and the reward of the step that led to this row
     "action", "reference_position", "gates_passed", "reward",
     "position_error", "estimation_error",
@@ -82,9 +107,9 @@ def _column(row: str | Column) -> Column:
     if isinstance(row, Column):
         return row
     quantity = QUANTITIES[row]
-    shape = tuple(FEATURES if isinstance(size, str) else size for size in quantity.shape)
     unit = "0 or 1" if quantity.kind is bool else quantity.unit
-    return Column(row, shape, unit, quantity.frame, quantity.meaning)
+    several = row if row in READINGS and READINGS[row].most_blocks > 1 else ""
+    return Column(row, quantity.shape, unit, quantity.frame, quantity.meaning, several)
 
 
 COLUMNS = tuple(map(_column, _ROWS))  #: columns of a flight, in order
@@ -96,17 +121,24 @@ WITH_FILTER = (
     *(name for name in READ if QUANTITIES[name].filtered),
     "covariance",
     "nees",
-    "gnss_decision",
-    "feature_decision",
+    *(decision.name for decision in _DECISIONS.values()),
 )
 """Columns that are NaN if no filter, and so no sensor, runs."""
 
 
-def row_dtype(features: int) -> np.dtype[Any]:
-    """Return the data type of a row for a number of features."""
-    return np.dtype(
-        [(c.name, "f8", tuple(features if n == FEATURES else n for n in c.shape)) for c in COLUMNS]
-    )
+_SEVERAL = tuple(name for name, reading in READINGS.items() if reading.most_blocks > 1)
+"""Readings of several blocks, of which a row has as many as the suite."""
+_OF_SENSORS = frozenset((*READINGS, *(decision.name for decision in _DECISIONS.values())))
+"""Columns of sensors, which files from before these sensors lack."""
+
+
+def row_dtype(blocks: Mapping[str, int]) -> np.dtype[Any]:
+    """Return the data type of a row, for numbers of blocks by reading."""
+
+    def shape(column: Column) -> tuple[int, ...]:
+        return tuple(blocks[column.several] if isinstance(n, str) else n for n in column.shape)
+
+    return np.dtype([(column.name, "f8", shape(column)) for column in COLUMNS])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -314,7 +346,7 @@ def load_flight(path: Path) -> tuple[NDArray[Any], FlightScene, dict[str, Any]]:
             elif entry.default is entry.default_factory is dataclasses.MISSING:
                 raise ValueError(f"it lacks {entry.name}")  # older files lack optional fields
         scene = FlightScene(**found)
-        rows = _rows(entries, len(scene.features_I))
+        rows = _rows(entries)
         return rows, scene, dict(header["about"])
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is not a complete flight: {error}") from None
@@ -336,14 +368,19 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
+def _rows(entries: dict[str, NDArray[Any]]) -> NDArray[Any]:
     count = len(entries.get("columns/time", ()))
     if not count:
         raise ValueError("it has no rows")
-    rows = np.zeros(count, row_dtype(features))
+    none = np.zeros((count, 0))
+    blocks = {name: entries.get(f"columns/{name}", none).shape[1] for name in _SEVERAL}
+    rows = np.zeros(count, row_dtype(blocks))
     for column in COLUMNS:
         if f"columns/{column.name}" not in entries:
-            raise ValueError(f"it lacks columns/{column.name}")
+            if column.name not in _OF_SENSORS:
+                raise ValueError(f"it lacks columns/{column.name}")
+            rows[column.name] = np.nan
+            continue
         values = entries[f"columns/{column.name}"]
         if values.shape != rows[column.name].shape or values.dtype != np.float64:
             raise ValueError(
@@ -363,9 +400,9 @@ def table(rows: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
             sigmas = np.sqrt(np.maximum(np.diagonal(values, axis1=1, axis2=2), 0.0))
             names = [f"sigma_{state}_{axis}" for state in _STATES for axis in "xyz"]
             found |= {name: sigmas[:, k] for k, name in enumerate(names)}
-        elif column.name == "pixels":
-            for k in range(values.shape[1]):
-                found |= {f"pixels_{k + 1}_{axis}": values[:, k, j] for j, axis in enumerate("xy")}
+        elif values.ndim == 3:
+            for k, j in np.ndindex(values.shape[1:]):
+                found[f"{column.name}_{k + 1}_{'xyz'[j]}"] = values[:, k, j]
         elif values.ndim == 1:
             found[column.name] = values
         else:
@@ -376,9 +413,9 @@ def table(rows: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
 
 def _parts(column: Column, count: int) -> Sequence[str]:
     """Return the suffixes of a column's names in a table, one per number."""
-    if column.name == "gnss_decision":
-        return [READINGS[name].label for name in FIXES]
-    if column.name in ("action", "rotor_speeds", "feature_decision"):
+    if column.labels:
+        return column.labels
+    if column.several or column.name in ("action", "rotor_speeds"):
         return [str(k + 1) for k in range(count)]
     return "wxyz" if column.name.endswith("quaternion") else "xyz"
 
@@ -478,7 +515,8 @@ class FlightRecorder:
         flight = check.whole("flight", flight, least=0, most=batch.count - 1)
         self._batch, self._which = batch, np.array([flight])
         self._about = dict(about or {})
-        self._rows = np.zeros(256, row_dtype(batch.sensors.blocks_of("pixels")))
+        blocks = {name: batch.sensors.blocks_of(name) for name in _SEVERAL}
+        self._rows = np.zeros(256, row_dtype(blocks))
         self._count = 0
         self._copies: list[NDArray[np.uint32]] = []
         """instants not yet converted to rows: a copy takes a hundredth of the time of a row"""
@@ -580,7 +618,7 @@ class FlightRecorder:
 def _fill(rows: NDArray[Any], batch: FlightBatch, scene: FlightScene) -> None:
     """Fill rows of `COLUMNS` with the instants of one flight, which `batch` has as flights."""
     for name in READ:
-        if batch.run_filter or name not in WITH_FILTER:
+        if rows[name].size and (batch.run_filter or name not in WITH_FILTER):
             rows[name] = batch.read(name)
     course = scene.task == "waypoints"
     rows["reference_position"] = (
@@ -593,12 +631,21 @@ def _fill(rows: NDArray[Any], batch: FlightBatch, scene: FlightScene) -> None:
     gate = batch.record("gate")
     rows["covariance"] = batch.covariance()
     rows["nees"] = _nees(rows, batch.record("R_hat"), rotation_vector=batch.sensors.flow_alone)
-    for k, name in enumerate(FIXES):
-        measured = ~np.isnan(rows[name]).all(axis=1)
-        rows["gnss_decision"][:, k] = np.where(measured, gate[:, BLOCKS_OF[name].start], np.nan)
-    seen = np.isfinite(rows["pixels"]).all(axis=2)
-    decisions = gate[:, BLOCKS_OF["pixels"]][:, : seen.shape[1]]
-    rows["feature_decision"] = np.where(seen, decisions, np.nan)
+    for sensor, decision in _DECISIONS.items():
+        found = [
+            _decided(rows, gate, reading) for reading in SENSOR_PARAMS[sensor].readings(sensor)
+        ]
+        rows[decision.name] = np.hstack(found).reshape(rows[decision.name].shape)
+
+
+def _decided(
+    rows: NDArray[Any], gate: NDArray[np.float64], reading: ReadingDefinition
+) -> NDArray[np.float64]:
+    """Decisions (n, blocks) on a reading, whose measurements the rows have; NaN: not measured."""
+    values = rows[reading.name]
+    count = values.shape[1] if reading.most_blocks > 1 else 1
+    seen = np.isfinite(values.reshape(len(values), count, reading.length)).all(axis=2)
+    return np.where(seen, gate[:, BLOCKS_OF[reading.name]][:, :count], np.nan)
 
 
 def _nees(

@@ -32,7 +32,7 @@ from quad_gym.envs.config import (
     TASK_KEYWORDS,
 )
 from quad_gym.envs.spaces import ObservationField
-from quad_gym.flights import COLUMNS, FEATURES
+from quad_gym.flights import COLUMNS
 from quad_gym.logs.formats.log import LOG_COLUMNS, LogColumn
 from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES
@@ -336,8 +336,7 @@ def _fields_page() -> str:
 
     def row(name: str, shape: Any, about: Any) -> tuple[str, ...]:
         if not isinstance(shape, str):
-            sizes = ("features" if n == FEATURES else str(n) for n in shape)
-            shape = f"({', '.join(sizes)})"
+            shape = f"({', '.join(map(str, shape))})"
         return f"`{name}`", shape, about.unit, about.frame, about.meaning
 
     fields = [row(name, quantity.shape, quantity) for name, quantity in QUANTITIES.items()]

@@ -110,6 +110,53 @@ def test_gate_decisions_are_recorded_with_their_measurements():
     assert np.isnan(lab["gnss_decision"][:, 2]).all()  # its receiver gives no velocity
 
 
+AIDED = at_rates(gnss=10.0).replace(
+    barometer=quad_gym.BarometerParams(rate=25.0),
+    uwb_range=quad_gym.UwbRangeParams(
+        rate=10.0,
+        anchors_I=((9.0, 0.0, 2.0), (0.0, 9.0, 0.5), (-9.0, 0.0, 3.0)),
+        outlier_probability=0.0,
+    ),
+)
+
+
+def test_measurements_and_decisions_of_every_sensor_are_recorded(tmp_path):
+    env, flight, _ = recorded_flight("hover", steps=50, sensors=AIDED, innovations=True)
+    measured = np.isfinite(flight["barometer"])
+    assert 15 < measured.sum() < 40
+    assert np.abs(flight["barometer"] - flight["position"][:, 2])[measured].max() < 5.0
+    np.testing.assert_array_equal(np.isfinite(flight["barometer_decision"]), measured)
+    assert np.isnan(flight["magnetometer"]).all()  # the suite has none
+    gaps = flight["position"][:, np.newaxis] - AIDED.uwb_range.anchors_I
+    measured = np.isfinite(flight["uwb_range"])
+    assert measured.shape == (51, 3)
+    assert measured.any(axis=0).all()
+    # six standard deviations, and the way between a range and the end of its row
+    assert np.abs(flight["uwb_range"] - np.linalg.norm(gaps, axis=2))[measured].max() < 0.6 + 0.1
+    np.testing.assert_array_equal(np.isfinite(flight["uwb_range_decision"]), measured)
+    gate = env.flights.batch.innovations()
+    last = [flight[f"{name}_decision"][-1] for name in ("gnss", "feature", "barometer", "uwb_range")]
+    decided = np.where(gate["measured"][0], gate["gate"][0], np.nan)
+    np.testing.assert_array_equal(np.hstack(last), decided)
+    assert_same_flights(flight, Flight.load(flight.save(tmp_path / "aided.npz")))
+    names = table(flight.rows)
+    np.testing.assert_array_equal(names["uwb_range_2"], flight["uwb_range"][:, 1])
+    np.testing.assert_array_equal(names["uwb_range_decision_3"], flight["uwb_range_decision"][:, 2])
+
+
+def test_file_from_before_a_sensor_has_nan_in_its_columns(tmp_path):
+    path = recorded_flight(sensors=AIDED)[1].save(tmp_path / "flight.npz")
+    with np.load(path) as archive:
+        entries = {name: archive[name] for name in archive.files}
+    for name in ("barometer", "barometer_decision", "uwb_range", "uwb_range_decision"):
+        del entries[f"columns/{name}"]
+    np.savez_compressed(path, **entries)
+    old = Flight.load(path)
+    assert np.isnan(old["barometer"]).all()
+    assert old["uwb_range"].shape == (len(old), 0)
+    assert np.isfinite(old["gnss_position"]).any()
+
+
 def test_wind_and_faults_are_kept():
     outage = GnssOutage(start=0.1, duration=0.1)
     _, flight, _ = recorded_flight(world="fresh_breeze", faults=outage)

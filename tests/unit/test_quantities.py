@@ -13,7 +13,17 @@ from quad_gym.records import Source
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests import builders
 
-ONLY_IN_FLIGHTS = {"covariance", "nees", "gnss_decision", "feature_decision"}
+ONLY_IN_FLIGHTS = {
+    "covariance",
+    "nees",
+    "gnss_decision",
+    "feature_decision",
+    "barometer_decision",
+    "magnetometer_decision",
+    "optical_flow_decision",
+    "range_finder_decision",
+    "uwb_range_decision",
+}
 AIDED = sensor_suite("rtk").replace(
     barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
 )
