@@ -15,8 +15,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.networks import Networks
-from baselines.compiled_ppo.training import STATE, NetworkTraining, as_floats, sizes_of
+from baselines.compiled_ppo.training import STATE, Networks, NetworkTraining, as_floats, sizes_of
 from baselines.mlp import FUNCTIONS
 from baselines.policies import NAMES, load_policy
 from baselines.recipes import IMITATION, Recipe

@@ -8,8 +8,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from baselines.compiled_ppo import kernels
-from baselines.compiled_ppo.networks import Networks
-from baselines.compiled_ppo.training import STATE, NetworkTraining, as_floats, sizes_of
+from baselines.compiled_ppo.training import STATE, Networks, NetworkTraining, as_floats, sizes_of
 from baselines.recipes import Recipe
 from quad_gym.batch.threads import (
     MIN_BLOCKS_PER_THREAD,
