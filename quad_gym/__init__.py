@@ -14,7 +14,7 @@ from quad_gym.envs import (
     register_all,
     register_task,
 )
-from quad_gym.envs.keywords import EnvKeywords
+from quad_gym.envs.config import EnvKeywords
 from quad_gym.params import sensor_table
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.imu import ImuParams

@@ -16,7 +16,7 @@ from baselines.mlp import MlpPolicy, mlp_of
 from baselines.normalization import Normalization, NormalizedPolicy
 from baselines.policies import is_included, load_policy, pretrained_file, record_of
 from quad_gym.envs import keywords_of
-from quad_gym.envs.keywords import env_option
+from quad_gym.envs.config import env_option
 from quad_gym.envs.spaces import ObservationField, layout_bounds
 from quad_gym.packing import params_record
 from quad_gym.params import checks as check

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.memory import FlightMemory
+from quad_gym.batch.memory import FlightMemory, State
 from quad_gym.params import checks as check
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.sensor_table import READINGS, SENSOR_OF
@@ -29,7 +29,6 @@ from quad_gym.records import (
     put_in_flights,
 )
 from quad_gym.records.inputs import SensorReading
-from quad_gym.records.state import State
 from quad_gym.rotations import NORM_ERROR, are_rotations, quaternion_to_dcm
 
 # --------------------------------------------------------------------------------------------------

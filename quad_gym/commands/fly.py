@@ -28,7 +28,7 @@ from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.commands.evaluate import gates_of
-from quad_gym.envs.keywords import Observation
+from quad_gym.envs.config import Observation
 from quad_gym.evaluation import Policy
 from quad_gym.faults import PRESETS, faults_of
 from quad_gym.params import checks as check

@@ -25,8 +25,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quad_gym.envs import IDS
-from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS, TASK_KEYWORDS, EnvConfig
-from quad_gym.envs.keywords import env_option
+from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS, TASK_KEYWORDS, EnvConfig, env_option
 from quad_gym.params import checks as check
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from quad_gym import IDS
 from quad_gym.commands import options
-from quad_gym.envs.keywords import env_option
+from quad_gym.envs.config import env_option
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from gymnasium.envs.registration import register, registry
 
-from quad_gym.envs.config import BENCHMARKS, require_known
-from quad_gym.envs.keywords import EnvKeywords, VectorKeywords, shows
+from quad_gym.envs.config import BENCHMARKS, EnvKeywords, VectorKeywords, require_known, shows
 from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
@@ -154,7 +153,7 @@ def make_torch_vec_env(
             'make_torch_vec_env needs torch: pip install "quad-gym[train]"'
         ) from error
     if checked_device(device).type == "cuda":
-        from quad_gym.envs.device_env import QuadDeviceVecEnv
+        from quad_gym.envs.torch_env import QuadDeviceVecEnv
 
         return QuadDeviceVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)
     return QuadTorchVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)

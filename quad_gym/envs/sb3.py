@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.config import Base, EnvConfig
+from quad_gym.envs.config import Base, EnvConfig, EnvKeywords, shows
 from quad_gym.envs.flights import (
     Flights,
     Rendered,
@@ -21,7 +21,6 @@ from quad_gym.envs.flights import (
     start_info,
     start_options,
 )
-from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result

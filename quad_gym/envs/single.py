@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from quad_gym.batch.starts import stream_key
-from quad_gym.envs.config import Base, EnvConfig
+from quad_gym.envs.config import Base, EnvConfig, EnvKeywords, shows
 from quad_gym.envs.flights import (
     RENDERING_METADATA,
     Flights,
@@ -17,7 +17,6 @@ from quad_gym.envs.flights import (
     info_of_flight,
     start_info,
 )
-from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result

@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.config import Base, EnvConfig
+from quad_gym.envs.config import Base, EnvConfig, EnvKeywords, shows
 from quad_gym.envs.flights import (
     RENDERING_METADATA,
     Flights,
@@ -22,7 +22,6 @@ from quad_gym.envs.flights import (
     replace_faults,
     start_info,
 )
-from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result

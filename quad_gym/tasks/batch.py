@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.memory import State
 from quad_gym.batch.starts import checked_mask, checked_start
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.params import checks as check
@@ -16,7 +17,6 @@ from quad_gym.params.checks import did_you_mean
 from quad_gym.params.task import TaskParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import RESULTS, Autoreset, Ending, Result
-from quad_gym.records.state import State
 from quad_gym.tasks.task import (
     BOUND,
     METHODS,

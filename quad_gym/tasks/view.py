@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.memory import Calls
+from quad_gym.batch.memory import Calls, State
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.batch.starts import hidden_points, nearest_obstacle
 from quad_gym.configuration import FlightConfiguration
@@ -24,7 +24,6 @@ from quad_gym.records import (
     covariance_of,
     in_double,
 )
-from quad_gym.records.state import State
 
 # --------------------------------------------------------------------------------------------------
 # `ReadableBatch`: flights whose state the views of a task can read.

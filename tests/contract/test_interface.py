@@ -15,9 +15,17 @@ import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
-from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS, EnvConfig, RenderingConfig, with_effect
+from quad_gym.envs.config import (
+    DEFAULTS,
+    TASK_KEYWORDS,
+    EnvConfig,
+    EnvKeywords,
+    RenderingConfig,
+    TaskKeywords,
+    VectorKeywords,
+    with_effect,
+)
 from quad_gym.envs.flights import Flights
-from quad_gym.envs.keywords import EnvKeywords, TaskKeywords, VectorKeywords
 from quad_gym.records import Autoreset
 
 ROOT = Path(__file__).parents[2]

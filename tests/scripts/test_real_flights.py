@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quad_gym import sensor_suite, vehicle_params
-from quad_gym.records.state import State
+from quad_gym.batch.memory import State
 from quad_gym.rotations import euler_to_dcm
 from scripts.studies.closed_loop import COLUMNS, FULL, fit_body, fly, read_flight, rms
 from scripts.studies.onboard_filter import OnboardFilter

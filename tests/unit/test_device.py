@@ -23,7 +23,7 @@ from tests.golden import device, ptx, sass
 from tests.golden.flights import trajectories
 
 torch = pytest.importorskip("torch")
-from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
+from quad_gym.envs.torch_env import QuadDeviceVecEnv  # noqa: E402
 from tests.contract.test_consistency_script import Held  # noqa: E402
 from tests.contract.test_torch_env import (  # noqa: E402
     assert_flights_equal,

@@ -135,7 +135,9 @@ def test_measurements_and_decisions_of_every_sensor_are_recorded(tmp_path):
     assert np.abs(flight["uwb_range"] - np.linalg.norm(gaps, axis=2))[measured].max() < 0.6 + 0.1
     np.testing.assert_array_equal(np.isfinite(flight["uwb_range_decision"]), measured)
     gate = env.flights.batch.innovations()
-    last = [flight[f"{name}_decision"][-1] for name in ("gnss", "feature", "barometer", "uwb_range")]
+    last = [
+        flight[f"{name}_decision"][-1] for name in ("gnss", "feature", "barometer", "uwb_range")
+    ]
     decided = np.where(gate["measured"][0], gate["gate"][0], np.nan)
     np.testing.assert_array_equal(np.hstack(last), decided)
     assert_same_flights(flight, Flight.load(flight.save(tmp_path / "aided.npz")))

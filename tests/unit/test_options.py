@@ -21,7 +21,7 @@ from quad_gym.commands.options import (
     usage_errors,
 )
 from quad_gym.envs import IDS
-from quad_gym.envs.keywords import env_option
+from quad_gym.envs.config import env_option
 from tests.console_commands import plain
 
 
