@@ -312,6 +312,16 @@ class AidParams(SensorBase):
         return 0.0
 
     @property
+    def scale(self) -> float:
+        """Divisor that normalizes the measurement in observations."""
+        return 1.0
+
+    @property
+    def raw_scales(self) -> tuple[float, ...]:
+        """`scale`."""
+        return (self.scale,)
+
+    @property
     def numbers(self) -> check.Matrix:
         """Further parameters of the sensor's kernel, at most `rows` triples."""
         return ()

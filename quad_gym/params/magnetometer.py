@@ -94,9 +94,9 @@ class MagnetometerParams(AidParams):
         return self.soft_iron_sigma
 
     @property
-    def raw_scales(self) -> tuple[float, ...]:
+    def scale(self) -> float:
         """Strength of the Earth's field, which normalizes observations [T]."""
-        return (self.strength,)
+        return self.strength
 
     @property
     def numbers(self) -> check.Matrix:

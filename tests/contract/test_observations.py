@@ -180,7 +180,7 @@ def test_measurements_of_other_sensors_follow_over_their_scales():
         values = batch.read(name).reshape(4, -1)
         assert seen[f"{name}_valid"].all()
         assert np.isfinite(values).all()
-        close(seen[name], values / getattr(suite, name).raw_scales[0])
+        close(seen[name], values / getattr(suite, name).scale)
 
 
 def test_slow_controller_receives_every_fix_since_its_last_step():
