@@ -417,7 +417,7 @@ def _parts(column: Column, count: int) -> Sequence[str]:
         return column.labels
     if column.several or column.name in ("action", "rotor_speeds"):
         return [str(k + 1) for k in range(count)]
-    return "wxyz" if column.name.endswith("quaternion") else "xyz"
+    return ("wxyz" if column.name.endswith("quaternion") else "xyz")[:count]
 
 
 # --------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import pytest
 import quad_gym
 from baselines import PDPolicy
 from quad_gym import Flight, FlightRecorder
+from quad_gym.batch.quantities import innovations_of
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
@@ -134,7 +135,7 @@ def test_measurements_and_decisions_of_every_sensor_are_recorded(tmp_path):
     # six standard deviations, and the way between a range and the end of its row
     assert np.abs(flight["uwb_range"] - np.linalg.norm(gaps, axis=2))[measured].max() < 0.6 + 0.1
     np.testing.assert_array_equal(np.isfinite(flight["uwb_range_decision"]), measured)
-    gate = env.flights.batch.innovations()
+    gate = innovations_of(env.flights.batch)
     last = [
         flight[f"{name}_decision"][-1] for name in ("gnss", "feature", "barometer", "uwb_range")
     ]
