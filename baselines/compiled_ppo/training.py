@@ -1,4 +1,4 @@
-"""`Networks`, and `NetworkTraining`: what their trainings have in common."""
+"""`Networks`, and `NetworkTraining`: the common part of their trainings."""
 
 from abc import ABC, abstractmethod
 from collections import deque
