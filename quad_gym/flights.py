@@ -21,7 +21,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.packing import params_record
 from quad_gym.params import checks as check
-from quad_gym.params.aids import ReadingDefinition
+from quad_gym.params.aids import AidParams, ReadingDefinition
 from quad_gym.params.sensor_table import READINGS, SENSOR_PARAMS
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import BLOCKS_OF, Source
@@ -128,8 +128,13 @@ WITH_FILTER = (
 
 _SEVERAL = tuple(name for name, reading in READINGS.items() if reading.most_blocks > 1)
 """Readings of several blocks, of which a row has as many as the suite."""
-_OF_SENSORS = frozenset((*READINGS, *(decision.name for decision in _DECISIONS.values())))
-"""Columns of sensors, which files from before these sensors lack."""
+_LATER = frozenset(
+    name
+    for sensor, kind in SENSOR_PARAMS.items()
+    if issubclass(kind, AidParams)
+    for name in (*(reading.name for reading in kind.readings(sensor)), _DECISIONS[sensor].name)
+)
+"""Columns that older files lack: aiding sensors besides GNSS and camera were not recorded."""
 
 
 def row_dtype(blocks: Mapping[str, int]) -> np.dtype[Any]:
@@ -346,7 +351,7 @@ def load_flight(path: Path) -> tuple[NDArray[Any], FlightScene, dict[str, Any]]:
             elif entry.default is entry.default_factory is dataclasses.MISSING:
                 raise ValueError(f"it lacks {entry.name}")  # older files lack optional fields
         scene = FlightScene(**found)
-        rows = _rows(entries)
+        rows = _rows(entries, len(scene.features_I))
         return rows, scene, dict(header["about"])
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is not a complete flight: {error}") from None
@@ -368,16 +373,18 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _rows(entries: dict[str, NDArray[Any]]) -> NDArray[Any]:
+def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
     count = len(entries.get("columns/time", ()))
     if not count:
         raise ValueError("it has no rows")
     none = np.zeros((count, 0))
-    blocks = {name: entries.get(f"columns/{name}", none).shape[1] for name in _SEVERAL}
+    shapes = {name: entries.get(f"columns/{name}", none).shape for name in _SEVERAL}
+    blocks = {name: shape[1] if len(shape) > 1 else 0 for name, shape in shapes.items()}
+    blocks["pixels"] = features
     rows = np.zeros(count, row_dtype(blocks))
     for column in COLUMNS:
         if f"columns/{column.name}" not in entries:
-            if column.name not in _OF_SENSORS:
+            if column.name not in _LATER:
                 raise ValueError(f"it lacks columns/{column.name}")
             rows[column.name] = np.nan
             continue

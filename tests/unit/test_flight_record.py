@@ -160,6 +160,28 @@ def test_file_from_before_a_sensor_has_nan_in_its_columns(tmp_path):
     assert np.isfinite(old["gnss_position"]).any()
 
 
+@pytest.mark.parametrize(
+    ("column", "change"),
+    [
+        ("gnss_position", None),
+        ("gnss_decision", None),
+        ("pixels", None),
+        ("pixels", lambda values: values[:, :1]),
+        ("uwb_range", lambda values: values[:, 0]),
+    ],
+)
+def test_file_without_a_column_or_with_one_of_another_shape_is_refused(tmp_path, column, change):
+    path = recorded_flight(sensors=AIDED)[1].save(tmp_path / "flight.npz")
+    with np.load(path) as archive:
+        entries = {name: archive[name] for name in archive.files}
+    values = entries.pop(f"columns/{column}")
+    if change is not None:
+        entries[f"columns/{column}"] = change(values)
+    np.savez_compressed(path, **entries)
+    with pytest.raises(ValueError, match=f"not a complete flight: .*{column}"):
+        Flight.load(path)
+
+
 def test_wind_and_faults_are_kept():
     outage = GnssOutage(start=0.1, duration=0.1)
     _, flight, _ = recorded_flight(world="fresh_breeze", faults=outage)
