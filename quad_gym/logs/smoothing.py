@@ -29,13 +29,14 @@ from scipy.linalg import cho_solve
 
 from quad_gym.estimation.filters import KalmanFilter, run_while_unknown
 from quad_gym.estimation.inputs import Tape
+from quad_gym.logs.double import in_double
 from quad_gym.logs.formats import Floats, Log, Reading
 from quad_gym.logs.replaying.player import ESTIMATORS, Player
 from quad_gym.logs.replaying.replay import in_parts, judged, named_start, prepared
 from quad_gym.logs.replaying.results import Smoothed
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import OPERATION, Operation, joint_covariance, require_double
+from quad_gym.records import OPERATION, Operation, joint_covariance
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
 _AT_ONCE = 256  #: operations between two readings of the filter's memory
@@ -45,6 +46,7 @@ _MIN_VARIANCE = 1e-14  #: added to all variances, in units of these, against rou
 _E = slice(6, 9)
 
 
+@in_double
 def smooth(
     log: Any,
     *,
@@ -57,7 +59,8 @@ def smooth(
     """Return the best trajectory of a log, with its covariance.
 
     Each estimate contains all measurements of the log, earlier and later ones. The arguments are as
-    in `quad_gym.estimation.replay`, whose `problems` also apply here.
+    in `quad_gym.estimation.replay`, whose `problems` also apply here. Where the process computes in
+    single precision, another one does this in double precision.
 
     Args:
         log: A table or a file, see `quad_gym.estimation.read_log`, or its result.
@@ -68,10 +71,9 @@ def smooth(
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
-        ValueError: As `replay`, if the heading is never known, or if the process computes in single
-            precision.
+        ValueError: As `replay`, if the heading is never known, or if an argument cannot be pickled
+            in single precision.
     """
-    require_double("smoothing, which inverts covariances,")
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, reading)

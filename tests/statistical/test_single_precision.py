@@ -82,6 +82,49 @@ def test_replay_in_single_precision_agree_with_double(tmp_path):
     assert single["verdict"] == double["verdict"]
 
 
+CALIBRATION = """
+import sys
+from pathlib import Path
+
+import numpy as np
+from quad_gym.estimation import calibrate, fit_vehicle
+from quad_gym.params.suites import CONSUMER
+from tests.logged_flights import Recorded, flown
+
+log, suite = Path(sys.argv[1]), CONSUMER.with_rates(imu=100.0).replace(barometer=None)
+if not log.exists():
+    flight = flown(suite, 14.0)
+    Recorded(flight, suite, lost=0.0, jitter=0.0).write_csv(log)
+    np.savez(log.with_suffix(".npz"), time=flight["time"], voltages=flight.about["voltages"])
+sentences = []
+found = calibrate(log, sensors=suite, share=0.6, delays=False, progress=sentences.append)
+replay = found.after.replay
+numbers = [
+    sentences,
+    found.numbers,
+    found.suite,
+    found.verdict,
+    found.after.sensors,
+    replay.position.tolist(),
+    replay.sigma.tolist(),
+    fit_vehicle(log, sensors=suite, motors=dict(np.load(log.with_suffix(".npz")))),
+]
+print(numbers)
+"""
+
+
+def test_calibration_in_single_precision_has_the_bits_of_double(tmp_path):
+    """The fit of a vehicle, too, and the sentences on progress."""
+    told = []
+    for precision in ("double", "single"):  # the first one writes the log
+        words = ("-c", CALIBRATION, str(tmp_path / "log.csv"))
+        done = run_python(*words, QUAD_GYM_PRECISION=precision)
+        assert done.returncode == 0, done.stderr
+        told.append(done.stdout)
+    assert told[0] == told[1]
+    assert "Computing intervals" in told[0]
+
+
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
 @pytest.mark.parametrize("suite", ["crazyflie", "rtk", "consumer", "uwb"])
 def test_exported_filters_in_single_precision_equal_replays_in_it(suite):

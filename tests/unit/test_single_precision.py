@@ -1,4 +1,4 @@
-"""Single precision of a process: its records, memory of exported filters, and refused calls."""
+"""Single precision of a process: its records, memory of exported filters, and analyses of logs."""
 
 import re
 
@@ -17,7 +17,6 @@ import numpy as np
 from quad_gym import UnscentedKalmanFilter, sensor_suite
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.main import main
-from quad_gym.estimation import calibrate, smooth
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH
 
 assert FLIGHT["r"].base == np.float64 and FLIGHT_BLOCK["r"].base == np.float32
@@ -47,14 +46,6 @@ assert [str(w.message).split(":")[0] for w in caught] == [
     "a flight is 1001 m from the origin, beyond 1000 m"
 ]
 main(["version"])
-for refused in (
-    lambda: calibrate({}, sensors="rtk"),
-    lambda: smooth({}, sensors="rtk"),
-):
-    try:
-        refused()
-    except ValueError as error:
-        print(error)
 """
 
 SINES = """
@@ -119,10 +110,122 @@ def test_flights_in_single_precision_equal_golden_flights():
     assert done.returncode == 0, done.stderr
 
 
-def test_single_precision_has_its_own_records_warns_of_distance_and_refuses_calibration():
+def test_single_precision_has_its_own_records_and_warns_of_distance():
     done = run_python("-c", RECORDS, QUAD_GYM_PRECISION="single")
     assert "(single precision)" in done.stdout, done.stderr
-    assert done.stdout.count("needs double precision, got QUAD_GYM_PRECISION=single") == 2
+
+
+ANALYSES = """
+import os
+import time
+import warnings
+
+from quad_gym.logs.double import in_double
+from quad_gym.records import PRECISION
+
+
+class OwnError(Exception):
+    def __init__(self, first, second):
+        super().__init__(f"{first} and {second}")
+
+
+@in_double
+def analysis(end="", progress=None):
+    print("printed there")
+    progress(os.getpid())
+    if end == "own":
+        raise OwnError("one", "two")
+    if end == "killed":
+        os._exit(3)
+    if end == "endless":
+        time.sleep(1000.0)
+    warnings.warn("too short", RuntimeWarning)
+    return PRECISION, end
+"""
+
+SCRIPT = """
+import os
+import signal
+import threading
+import warnings
+
+from analyses import analysis
+
+
+class Own:
+    pass
+
+
+def refused(kind, text, end, progress=print):
+    try:
+        analysis(end, progress=progress)
+    except kind as error:
+        assert text in str(error), error
+        return error
+    raise AssertionError(end)
+
+
+def interrupt(process):
+    seen.append(process)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+
+seen = []
+print("in", os.getpid())
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    assert analysis(progress=seen.append) == ("double", "")
+assert [str(w.message) for w in caught] == ["too short"]
+assert "in analysis" in refused(RuntimeError, "OwnError: one and two", "own").__notes__[0]
+refused(RuntimeError, "ended with exit code 3", "killed")
+refused(ValueError, "arguments cannot be sent there", Own())
+refused(ValueError, "arguments cannot be sent there", lambda: None)
+refused(KeyboardInterrupt, "", "endless", interrupt)
+assert len(seen) == 2
+for process in seen:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        continue
+    raise AssertionError("a process is left")
+"""
+
+
+def test_analyses_in_double_precision_pass_progress_warnings_errors_and_interrupts(tmp_path):
+    """To a script whose main module has no guard."""
+    (tmp_path / "analyses.py").write_text(ANALYSES)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    done = run_python("script.py", where=tmp_path, QUAD_GYM_PRECISION="single")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("in ") == 1
+    assert done.stderr.count("printed there") == 4
+
+
+SMOOTHED = """
+import numpy as np
+from quad_gym import sensor_suite
+from quad_gym.estimation import smooth
+
+rng, n = np.random.default_rng(3), 60
+table = {
+    "time": 0.02 * np.arange(n),
+    "gyro": 1e-4 * rng.normal(size=(n, 3)),
+    "accel": [0.0, 0.0, 9.8] + 0.02 * rng.normal(size=(n, 3)),
+    "gnss_enu": np.where(np.arange(n)[:, np.newaxis] % 10, np.nan, 0.02 * rng.normal(size=(n, 3))),
+}
+found = smooth(table, sensors="rtk", start={"heading": 0.3})
+for name in ("position", "quaternion", "sigma", "covariance"):
+    print(getattr(found, name).tobytes().hex())
+"""
+
+
+def test_smoothing_in_single_precision_has_the_bits_of_double():
+    done = [
+        run_python("-c", SMOOTHED, QUAD_GYM_PRECISION=precision, QUAD_GYM_LANES=lanes)
+        for precision, lanes in (("double", None), ("single", "16"))
+    ]
+    assert done[1].stdout == done[0].stdout, done[1].stderr
+    assert len(done[0].stdout) > 10_000, done[0].stderr
 
 
 MEMORY = """

@@ -15,6 +15,7 @@ import numpy as np
 
 from quad_gym.logs.calibrating.likelihood import Validation, in_flight, pooled, validate
 from quad_gym.logs.calibrating.search import Calibrated, NumberSearch, has_heading
+from quad_gym.logs.double import in_double
 from quad_gym.logs.formats import Log, Reading, read_log
 from quad_gym.logs.formats.clocks import longest_part, naming
 from quad_gym.logs.formats.quantities import compared
@@ -24,7 +25,6 @@ from quad_gym.logs.replaying.rules import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite, sensor_suite
-from quad_gym.records import require_double
 
 _IRON_TAU = 30.0
 """Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change
@@ -82,6 +82,7 @@ class Calibration:
         )
 
 
+@in_double
 def calibrate(
     log: Any,
     *,
@@ -94,6 +95,8 @@ def calibrate(
     **reading: Unpack[Reading],
 ) -> Calibration:
     """Find the numbers of a sensor suite from the log of a flight, or of several.
+
+    Where the process computes in single precision, another one does this in double precision.
 
     Args:
         log: A table or a file, see `read_log`; or a list of them, of one vehicle.
@@ -111,9 +114,9 @@ def calibrate(
 
     Raises:
         ValueError: If a log or an argument is invalid, units or axes of the log are implausible,
-            the heading at the start is unknown, or the process computes in single precision.
+            the heading at the start is unknown, or an argument cannot be pickled in single
+            precision.
     """
-    require_double("a calibration, which takes differences of likelihoods,")
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
     check.number("share", share, least=0.05, most=0.95)

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_gym.logs.double import in_double
 from quad_gym.logs.formats import Floats, Log, Reading, read_log
 from quad_gym.logs.formats.clocks import longest_part
 from quad_gym.logs.replaying.replay import prepared
@@ -66,6 +67,7 @@ class FittedVehicle(NamedTuple):
     """a calm world with this linear drag, where its interval is above zero"""
 
 
+@in_double
 def fit_vehicle(
     log: Any,
     *,
@@ -78,7 +80,8 @@ def fit_vehicle(
     """Find thrust, rotor lag, drag and battery sag of a vehicle from a log, or from several.
 
     Accelerations show forces over the mass: the mass stays as in `vehicle`, and the steady rotor
-    speed per volt as well.
+    speed per volt as well. Where the process computes in single precision, another one does this in
+    double precision.
 
     Args:
         log: A table or a file, see `read_log`; or a list of them.
