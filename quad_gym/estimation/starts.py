@@ -448,7 +448,7 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     _require_relative(position)
     sigmas = np.array(sensors.gnss.position_sigma_I)
     if fix.gnss_sigma is not None:
-        sigmas = sigmas_of(measured, "gnss_position").copy()
+        sigmas = sigmas_of(measured, "gnss_position").astype(np.float64)
     velocity, speeds = _first_velocity(sensors, fix)
     baseline = fix.gnss_baseline_G
     if baseline is not None:

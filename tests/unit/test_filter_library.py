@@ -199,6 +199,20 @@ def test_example_equals_replay_with_a_compass_that_reverses_in_flight(name):
 
 
 @needs_compiler
+@pytest.mark.slow  # it compiles a filter for export
+def test_example_equals_replay_after_a_fix_of_consumer_with_reported_noise():
+    """In single precision, too, the reported noise is scaled in double precision, here by 2."""
+    suite = quad_gym.sensor_suite("consumer")
+    suite = suite.replace(estimator=suite.estimator.replace(initial_covariance_scale=2.0))
+    table = Recorded(flown(suite, 3.0), suite).table()
+    table = {k: v for k, v in table.items() if np.isfinite(v).any()}
+    for axis, sigma in (("east", 0.7), ("north", 0.9), ("up", 1.3)):
+        table[f"gnss_sigma_{axis}"] = np.where(np.isfinite(table["gnss_up"]), sigma, np.nan)
+    name = str(suite.save(FOLDER / "scaled.toml"))
+    require_equal(partial(estimates, example(name, "x86-64")), table, suite, {})
+
+
+@needs_compiler
 def test_exported_filter_takes_samples_in_the_axes_of_sensors(tmp_path):
     """Rows of samples are those of the log, and the library rotates them as the replay does."""
     suite = quad_gym.sensor_suite("consumer").replace(
