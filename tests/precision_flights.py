@@ -11,10 +11,11 @@ import sys
 
 import numpy as np
 
-from quad_gym import sensor_suite, vehicle_params
+from quad_gym import GroundParams, WorldParams, sensor_suite, vehicle_params
 from quad_gym.analysis.consistency import InnovationRecorder, NeesRecorder, endless
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.config import TASK_DEFAULTS
+from quad_gym.faults import AccelBiasStep, GyroBiasStep
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import PRECISION, Source
 
@@ -31,8 +32,12 @@ def cases():
     for suite in ("rtk", "consumer", "crazyflie"):
         found[f"{suite}, warm"] = (suite, "ukf", {"filter_start": "warm"})
     found["consumer, from the ground"] = ("consumer", "ukf", {"start": "ground"})
+    on_feet = {"start": "ground", "world": WorldParams(ground=GroundParams())}
+    found["rtk, on feet"] = ("rtk", "ukf", on_feet)
     for fault in ("gnss_outage", "gnss_jump", "gnss_outliers", "imu_bias_step"):
         found[f"rtk, {fault}"] = ("rtk", "ukf", {"faults": fault})
+    for suite, fault in (("rtk", GyroBiasStep(size=0.2)), ("consumer", AccelBiasStep(size=3.0))):
+        found[f"{suite}, resets"] = (suite, "ukf", {"faults": fault.replace(start=5.0)})
     return found
 
 
