@@ -6,6 +6,7 @@ from typing import Any
 
 from baselines.mlp import MlpPolicy
 from baselines.policies import PRETRAINED
+from scripts.included import PLANS
 
 _HEAD = """# Included policies
 
@@ -56,6 +57,7 @@ def _card(file: Path) -> str:
         "network": f"multilayer perceptron {'-'.join(map(str, sizes))}, {policy.activations[0]}",
         "training": f"{_method(recipe)}, {record.get('steps', recipe['steps']):,} steps, "
         f"{recipe['n_envs']} flights, seed {plan['seed']}, engine {plan.get('engine', 'sb3')}",
+        "command": f"`python -m scripts.included {file.stem}`, {_choice(file.stem)}",
         "validation": _validation(best),
         "trained": f"{record['ended'][:10]}, quad_gym {record['versions']['quad_gym']}"
         if "ended" in record
@@ -63,6 +65,12 @@ def _card(file: Path) -> str:
     }
     lines = "".join(f"| {name} | {text} |\n" for name, text in rows.items() if text)
     return f"\n## `{file.name}`\n\n| | |\n|---|---|\n{lines}"
+
+
+def _choice(name: str) -> str:
+    """Seeds of which the policy is the best."""
+    seeds = PLANS[name][1]
+    return "one seed" if seeds == 1 else f"the best validation of {seeds} seeds"
 
 
 def _validation(best: dict[str, Any] | None) -> str:

@@ -1,4 +1,4 @@
-"""Catalog of results: commands, golden flights, texts and figures.
+"""Catalog of results: commands, golden flights, policies, texts and figures.
 
 To add a result, add an entry, and its marks to a page (`docs.renewal.pages`).
 """
@@ -20,6 +20,8 @@ class Result:
     """options of `quad-gym`, a script or a module of scripts; OUT is a folder for each command"""
     flights: tuple[str, ...]
     """patterns of the golden flights of its tasks and suites; none for times"""
+    policies: tuple[str, ...] = ()
+    """included policies that it flies, by the names of their files"""
     texts: Texts
     """function of the folder and the printed output that returns texts by mark"""
     figures: Mapping[str, str] = field(default_factory=dict)
@@ -44,17 +46,21 @@ def _benchmark(section: str) -> str:
     return f"benchmark --only {section}" if package else f"scripts.benchmarks {section}"
 
 
-def _pictures(study: str, task: str, options: str, *names: str) -> Result:
+def _pictures(
+    study: str, task: str, options: str, *names: str, policies: tuple[str, ...]
+) -> Result:
     """Pictures of the policies that are included, and of one trained on the truth."""
     return Result(
         name=f"{study}_pictures",
         commands=[f"scripts.studies {study} {options} --first-episode 100000 --output OUT"],
         flights=(task, f"{task}, truth"),
+        policies=policies,
         texts=lambda _, __: {},
         figures={f"0/{name}": f"docs/images/{study}_{name}" for name in names},
     )
 
 
+_LOOKING = ("look_around", "look_around_truth")
 _FILMED = "--arms truth included --seeds 1 --episodes 200 --video webp"
 _DEFAULTS = (
     "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {} --every 2000000"
@@ -74,12 +80,14 @@ CATALOG = {
             name="evaluate",
             commands=["evaluate QuadGym/Circle-v0 --policy pd pretrained --output OUT"],
             flights=("Circle, standard", "observation truth, standard"),
+            policies=("circle",),
             texts=texts.console("evaluate"),
         ),
         Result(
             name="policies",
             commands=[_EVALUATE.format(task) for task in (*TRACKING, "Waypoints")],
             flights=("*, standard",),
+            policies=("hover", "circle", "lemniscate", "random_trajectory", "waypoints"),
             texts=texts.policies,
         ),
         Result(
@@ -92,6 +100,7 @@ CATALOG = {
             name="betaflight",
             commands=["docs.examples.betaflight --output OUT"],
             flights=("Circle, standard", "Hover, standard"),
+            policies=("circle",),
             texts=texts.console("betaflight"),
             figures={"0/betaflight.png": "docs/images/betaflight.png"},
         ),
@@ -159,9 +168,17 @@ CATALOG = {
             flights=("RandomTrajectory, rtk", "breeze"),
             texts=texts.ablation("models"),
         ),
-        _pictures("look_around", "LookAround", "--arms included_truth included", "glance.png"),
-        _pictures("stale_race", "StaleRace", _FILMED, "film.webp", "pace.png"),
-        _pictures("outage_dash", "OutageDash", _FILMED, "film.webp", "pace.png"),
+        _pictures(
+            "look_around",
+            "LookAround",
+            "--arms included_truth included",
+            "glance.png",
+            policies=_LOOKING,
+        ),
+        *(
+            _pictures(study, task, _FILMED, "film.webp", "pace.png", policies=(study,))
+            for study, task in (("stale_race", "StaleRace"), ("outage_dash", "OutageDash"))
+        ),
         Result(
             name="look_around_included",
             commands=[
@@ -169,6 +186,7 @@ CATALOG = {
                 "pretrained --observation estimate --episodes 2000 --output OUT"
             ],
             flights=("LookAround",),
+            policies=_LOOKING,
             texts=texts.included("look_around"),
         ),
         Result(
@@ -178,6 +196,7 @@ CATALOG = {
                 "--episodes 20 --video webp --output OUT"
             ],
             flights=("LookAround",),
+            policies=_LOOKING,
             texts=lambda _, __: {},
             figures={"0/video.webp": "docs/images/look_around_film.webp"},
         ),
@@ -195,6 +214,7 @@ CATALOG = {
                 "--output OUT --first-episode 100000 --episodes 1000"
             ],
             flights=("LookAround",),
+            policies=("look_around",),
             texts=texts.variants("miscalibrated", "condition", "success", "crashed", "error"),
         ),
         Result(
@@ -204,6 +224,7 @@ CATALOG = {
                 "--output OUT --first-episode 100000"
             ],
             flights=("StaleRace",),
+            policies=("stale_race",),
             texts=texts.variants("masked", "observed", "success", "crashed"),
         ),
         Result(
@@ -227,6 +248,7 @@ CATALOG = {
                 for path in _FLOWN_ON.values()
             ],
             flights=("LookAround", "OutageDash"),
+            policies=("look_around", "outage_dash"),
             texts=texts.flown(list(_FLOWN_ON)),
         ),
         Result(

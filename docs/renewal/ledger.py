@@ -1,7 +1,8 @@
 """Ledger of results: commands, digest of golden flights and texts of each result.
 
-A result is stale if its commands or the golden flights of its tasks and suites have changed. It
-stays valid after a change of the code that keeps these flights bitwise equal.
+A result is stale if its commands, the golden flights of its tasks and suites, or the included
+policies that it flies have changed. It stays valid after a change of the code that keeps these
+flights bitwise equal.
 """
 
 import fnmatch
@@ -10,6 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from baselines.policies import PRETRAINED
 from docs.renewal import release
 from docs.renewal.catalog import Result
 from scripts.estimate_bench import table as estimate_bench
@@ -31,7 +33,7 @@ def write(entries: dict[str, Any]) -> None:
 
 
 def digest(result: Result) -> str:
-    """Digest of the golden flights of the tasks and suites of a result.
+    """Digest of the golden flights of the tasks and suites of a result, and of its policies.
 
     Raises:
         ValueError: If a pattern matches no golden flight.
@@ -43,6 +45,9 @@ def digest(result: Result) -> str:
         if not names:
             raise ValueError(f"{result.name}: no golden flight is named {pattern}")
         chosen |= {name: golden[name] for name in names}
+    for name in result.policies:
+        weights = (PRETRAINED / f"{name}.npz").read_bytes()
+        chosen[f"policy {name}"] = hashlib.sha256(weights).hexdigest()
     return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()[:16]
 
 

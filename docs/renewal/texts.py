@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -47,9 +48,38 @@ def _body(printed: str) -> str:
     return printed.partition("\nWrote ")[0]
 
 
+_TRAINED = "training on the estimate"
+COMPARED = {
+    ("flying on the estimate", "on the truth"): "trained on the truth: error on the estimate minus "
+    "error on the truth",
+    (
+        _TRAINED,
+        "training on the truth",
+    ): "on the estimate: trained on it minus trained on the truth",
+    (_TRAINED, "training on the noisy truth"): "on the estimate: trained on it minus trained on "
+    "noisy truth",
+    (_TRAINED, "tuned PD control"): "on the estimate: trained on it minus tuned PD control",
+}
+"""Rows of the short table of a comparison, by the two sides of the sentence with the interval."""
+
+
 def compare(_: Path, printed: Sequence[str]) -> dict[str, str]:
-    """The tables and conclusions of a comparison, without its progress."""
-    return {"compare": block(_body(printed[0][printed[0].index("\nSensors ") :]))}
+    """The tables and conclusions of a comparison, without its progress, and a short table."""
+    body = _body(printed[0][printed[0].index("\nSensors ") :])
+    return {"compare": block(body), "compare.short": compared(body)}
+
+
+def compared(body: str) -> str:
+    """Table of the 95 % intervals of a comparison's sentences, with a column for each suite."""
+    suites, rows = dict.fromkeys(re.findall(r"^Sensors (\w+):", body, re.MULTILINE)), []
+    for (first, second), row in COMPARED.items():
+        sentence = (
+            rf"^Sensors (\w+): {first} (?:and|gives .+? than) {second}"
+            r"(?: are statistically indistinguishable)? \(\d+ seeds, 95 % interval (.+?)\)"
+        )
+        intervals = dict(re.findall(sentence, body, re.MULTILINE))
+        rows.append([row, *(intervals[suite] for suite in suites)])
+    return table(["95 % interval of the mean difference", *(f"`{s}`" for s in suites)], rows)
 
 
 def console(name: str) -> Texts:

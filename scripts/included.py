@@ -1,0 +1,95 @@
+"""Train the included policies again, with the plans and seeds of their model cards.
+
+    python -m scripts.included                        # all of them
+    python -m scripts.included circle look_around     # some
+    python -m scripts.included look_around --seeds 2  # fewer seeds, for a trial
+
+Of several seeds, the policy with the best validation is kept, as `baselines/pretrained/NAME.npz`.
+Each training is a folder in results/included: an interrupted command continues where it stopped.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from baselines.policies import PRETRAINED
+from baselines.recipes import IMITATION, Plan, recipe
+from baselines.training import TrainingResult, export, train
+from quad_gym.commands import options
+from quad_gym.params import checks as check
+
+_TRUTH = {"observation": "truth"}
+_LOOKS = {"task": "baselines.arm_tasks:WithStd"}
+_CERTAIN = {"task": "scripts.studies.arm_tasks:WithStdCertaintyReward"}
+_UNCERTAIN = {"task": "baselines.arm_tasks:WithUncertainty"}
+_FOR_RULE = {"task": "scripts.studies.arm_tasks:WithUncertaintyForRule", "include_std": True}
+_BACKS_OFF = {"teacher": "scripts.studies.rules:BacksOff"}
+
+
+def _plan(task: str, algorithm: str = "ppo", evaluations: int = 20, **more: object) -> Plan:
+    env_id = f"QuadGym/{task}-v0"
+    chosen = {"recipe": recipe(env_id, algorithm), "engine": "compiled", **more}
+    return Plan(env_id=env_id, evaluations=evaluations, **chosen)  # type: ignore[arg-type]
+
+
+PLANS: Mapping[str, tuple[Plan, int]] = {
+    "circle": (_plan("Circle"), 1),
+    "circle_truth": (_plan("Circle", environment=_TRUTH), 1),
+    "hover": (_plan("Hover"), 1),
+    "lemniscate": (_plan("Lemniscate"), 1),
+    "random_trajectory": (_plan("RandomTrajectory"), 1),
+    "waypoints": (_plan("Waypoints"), 1),
+    "look_around": (_plan("LookAround", "ppo", 9, environment=_LOOKS, learning=_CERTAIN), 3),
+    "look_around_truth": (_plan("LookAround", "ppo", 9, environment=_TRUTH), 1),
+    "stale_race": (_plan("StaleRace", "ppo", 8, environment={"include_std": True}), 20),
+    "outage_dash": (
+        _plan("OutageDash", IMITATION, 2, environment=_UNCERTAIN, learning=_FOR_RULE).replace(
+            recipe=recipe("QuadGym/OutageDash-v0", IMITATION).replace(parameters=_BACKS_OFF)
+        ),
+        1,
+    ),
+}
+"""Plan of each policy, and the number of seeds of which the best validation is kept."""
+
+
+@dataclass(frozen=True)
+class IncludedArgs:
+    """Options of the trainings."""
+
+    names: Positional[tuple[str, ...]] = tuple(PLANS)
+    """names of the policies"""
+    seeds: int | None = None
+    """largest number of seeds, for a trial"""
+    output: Path = Path("results/included")
+    """folder of the trainings"""
+    pretrained: Path = PRETRAINED
+    """folder of the policies"""
+
+
+def best_of(name: str, folder: Path, most: int | None = None) -> TrainingResult:
+    """Train a policy with its seeds, and return the training with the best validation."""
+    plan, seeds = PLANS[name]
+    trained = []
+    for seed in range(seeds if most is None else min(seeds, most)):
+        print(f"{name}, seed {seed}", flush=True)
+        result = train(plan.replace(seed=seed), folder / name / f"seed_{seed}", resume=True)
+        if not result.finished:
+            raise SystemExit("stopped; the same command continues")
+        trained.append(result)
+    return max(trained, key=lambda result: result.best["score"])
+
+
+def main(args: IncludedArgs) -> None:
+    """Train the policies, and write their files."""
+    for name in args.names:
+        check.choice("names", name, tuple(PLANS))
+    for name in args.names:
+        best = best_of(name, args.output, args.seeds)
+        export(best, file := args.pretrained / f"{name}.npz")
+        print(f"{file}: {best.folder.name}, score {best.best['score']:.3f}")
+
+
+if __name__ == "__main__":
+    main(options.parse(IncludedArgs, prog="python -m scripts.included", description=__doc__))
