@@ -48,7 +48,7 @@ PLANS: Mapping[str, tuple[Plan, int]] = {
         _plan("OutageDash", IMITATION, 2, environment=_UNCERTAIN, learning=_FOR_RULE).replace(
             recipe=recipe("QuadGym/OutageDash-v0", IMITATION).replace(parameters=_BACKS_OFF)
         ),
-        1,
+        10,
     ),
 }
 """Plan of each policy, and the number of seeds of which the best validation is kept."""
