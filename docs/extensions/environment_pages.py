@@ -265,7 +265,8 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
             f'env = gymnasium.make("{env_id}")\n```\n',
             f"{FILM}\n",
             f"{different}Unless stated here, observation, action, reward, start, endings and "
-            "`info` follow the [specification](../specification.md) of all environments.\n",
+            "`info` follow the [specification](../specification.md) of all environments. "
+            "[Your own task](../../tasks.md) changes them.\n",
             "## Keywords\n",
             "These defaults differ from the [common ones](../keywords.md):\n"
             if differ

@@ -204,6 +204,7 @@ CATALOG = {
             name="tutorial",
             commands=["docs/examples/tutorial.py --output OUT"],
             flights=("LookAround", "LookAround, truth"),
+            policies=("look_around_truth",),
             texts=texts.tutorial,
             figures={"0/crashed.png": "docs/images/tutorial.png"},
         ),

@@ -43,8 +43,7 @@ class LookAround(Task):
 
     At most 0.35 per step, so 262.5 in an episode of 750 steps. Neither of two simple rules gets
     it: PD control that tracks the desired heading loses its position in two thirds of the
-    episodes, and PD control that faces the wall forgoes the reward for the heading. The page "Your
-    own task" changes this reward.
+    episodes, and PD control that faces the wall forgoes the reward for the heading.
 
     ## Observation
     The built-in observation, followed by `features_direction` (3): the unit vector from the
