@@ -249,8 +249,8 @@ QUANTITIES = {
 def innovations_of(batch: FlightMemory) -> dict[str, NDArray[Any]]:
     """Return the last innovations of all flights, block by block.
 
-    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
-    if the suite has them.
+    The blocks are position, baseline, velocity and features, followed by those of the suite's other
+    sensors, in the order of `SensorTable`.
 
     Returns:
         Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and

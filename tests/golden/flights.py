@@ -274,7 +274,7 @@ def main():
         digests = {name: fly(case) for name, case in cases().items()}
         DIGESTS.write_text(json.dumps(digests, indent=1) + "\n")
     elif changed := differing(names):
-        raise SystemExit(f"these flights have changed: {', '.join(changed)}")
+        raise SystemExit(f"these flights have changed, or have no digest: {', '.join(changed)}")
     else:
         print(f"{len(names)} golden flights are as they were")
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import quad_gym
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.records import FEATURE_SLICE
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests.builders import flown, vec_env
@@ -35,9 +36,10 @@ def value_of(view, name):
 def test_fields_have_the_shape_and_type_of_the_table(task):
     batch, view = view_of(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
     lengths = {"n": FLIGHTS, "m": len(batch.sensors.camera.features_I), "k": 28}
-    lengths["o"], lengths["blocks"] = 0, quad_gym.UwbRangeParams.most_blocks  # without the sensor
-    lengths["gates"] = 5 if task == "waypoints" else 0
+    lengths["o"], lengths["gates"] = 0, 5 if task == "waypoints" else 0
     for field in VIEW_FIELDS:
+        if field.name.removeprefix("measured.") in AID_PARAMS:  # as without the sensor
+            lengths["blocks"] = AID_PARAMS[field.name.removeprefix("measured.")].most_blocks
         value = value_of(view, field.name)
         if not field.shape or field.shape.startswith("dict"):
             continue

@@ -11,6 +11,7 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.kernels.stages import Stage
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.records import (
     AID_BLOCK,
     AID_GROUPS,
@@ -120,7 +121,7 @@ def test_first_position_far_beyond_the_gate_is_a_step_of_the_sensor(ratio):
 
 def test_positions_after_a_step_are_rejected_until_one_is_within_the_gate():
     share = np.resize([0.99, 1.01], EIGHT)
-    rows, stepped = (np.zeros((EIGHT, 9)) for _ in range(2))
+    rows, stepped = (np.zeros((EIGHT, len(READINGS))) for _ in range(2))
     rows[:, POSITION_BLOCK], stepped[:, POSITION_BLOCK] = 3.0, np.repeat([0.0, 1.0], 4)
     rules, _ = located(GATE * share, rejected_in_row=rows, stepped=stepped)
     beyond = share > 1.0
@@ -138,7 +139,7 @@ def test_receiver_with_wrong_velocities_is_used_again_with_its_position(position
     rest = GATE - (0.0 if math.isnan(position_nis) else position_nis)
     nis = rest * np.resize([0.98, 1.02], EIGHT)
     rules = LaneRules(SUITE, (0.1, 1e-6, 1e-6, 1e-6, 1e-6))
-    rows, stepped = (np.zeros((EIGHT, 9)) for _ in range(2))
+    rows, stepped = (np.zeros((EIGHT, len(READINGS))) for _ in range(2))
     stepped[:, VELOCITY_BLOCK] = np.repeat([1.0, 1.0, 0.0, 0.0], 2)
     rows[:, VELOCITY_BLOCK] = np.repeat([2.0, 2.0, 2.0, 0.0], 2)
     wrong = (stepped > 0.0).any(axis=1) & (rows > 0.0).any(axis=1)
@@ -192,7 +193,7 @@ def test_ranges_beyond_the_gate_are_rejected_while_most_agree():
     far = 2.0 * GATE_OF_RANGES
     nis = np.array([[far] * n + [1.0] * (6 - n) for n in (0, 1, 2, 3, 4, 5, 6, 2)])
     for row in (0.0, 1.0):
-        rows = np.zeros((EIGHT, 9))
+        rows = np.zeros((EIGHT, len(READINGS)))
         rows[:, GROUP] = row
         rules = ranged(nis, rejected_in_row=rows)
         beyond = nis > GATE_OF_RANGES
@@ -234,7 +235,7 @@ def test_range_that_is_rejected_again_counts_if_three_others_agree(anchors, befo
 
 def test_range_that_is_rejected_again_does_not_count_if_gnss_confirms_the_position():
     nis = np.array([3.0 * GATE_OF_RANGES, 0.5, 0.7, 0.9])
-    accepted = np.tile(NEVER, (EIGHT, 9))
+    accepted = np.tile(NEVER, (EIGHT, len(READINGS)))
     accepted[:, [POSITION_BLOCK, VELOCITY_BLOCK]] = NOW - 0.5 * SECOND
     accepted[4:, POSITION_BLOCK] = NOW - 1.5 * SECOND
     rules = ranged(nis, 4, before=[REJECTED, 1, 1, 1], accepted_tick=accepted)
@@ -255,7 +256,7 @@ def test_noise_follows_the_scatter_of_successive_innovations(factor):
     measurements that follow three rejected ones, do not count.
     """
     scatter = GATE * np.array([0.0, 0.1, 0.5, 0.9, 1.5, 3.9, 4.1, 0.5])
-    rows = np.zeros((EIGHT, 9))
+    rows = np.zeros((EIGHT, len(READINGS)))
     rows[:, POSITION_BLOCK] = [0, 0, 2, 2, 2, 2, 2, 3]
     rules = LaneRules(SUITE, np.full(5, 1e-7))
     last, now = np.zeros((EIGHT, 3)), np.zeros((EIGHT, 3))

@@ -18,11 +18,7 @@ ONLY_IN_FLIGHTS = {
     "nees",
     "gnss_decision",
     "feature_decision",
-    "barometer_decision",
-    "magnetometer_decision",
-    "optical_flow_decision",
-    "range_finder_decision",
-    "uwb_range_decision",
+    *(f"{name}_decision" for name in AID_PARAMS),
 }
 AIDED = sensor_suite("rtk").replace(
     barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()

@@ -10,7 +10,7 @@ import pytest
 
 import quad_gym
 from quad_gym.kernels.stages import Stage
-from quad_gym.params.sensor_table import READINGS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 from quad_gym.params.world import GROUND_HEIGHT
 from quad_gym.records import (
     AID_GROUPS,
@@ -26,11 +26,8 @@ from tests.level_flights import GRAVITY, MAGNETIC
 
 RTK = quad_gym.sensor_suite("rtk").simplified()
 ALL = RTK.replace(
-    barometer=quad_gym.BarometerParams(),
-    magnetometer=quad_gym.MagnetometerParams(),
-    optical_flow=quad_gym.OpticalFlowParams(),
-    range_finder=quad_gym.RangeFinderParams(),
-    uwb_range=quad_gym.UwbRangeParams(),
+    camera=RTK.camera.replace(features_I=RTK.camera.features_I[:2]),  # an instant has room for 20
+    **{name: kind() for name, kind in AID_PARAMS.items()},
 )
 DRIFTING = MAGNETIC.replace(
     gnss=MAGNETIC.gnss.replace(
@@ -44,7 +41,7 @@ NOW, SECOND = LaneRules.tick, ALL.imu.rate
 LONG_AGO = NOW - 1000.0 * SECOND
 WAIT, GLITCH = ALL.estimator.reset_timeout, ALL.estimator.glitch_timeout
 MOST = ALL.estimator.max_rejections
-SEVERAL = {"pixels", "uwb_range"}
+SEVERAL = {name for name, reading in READINGS.items() if reading.most_blocks > 1}
 
 
 def groups_of(values, default=0.0):

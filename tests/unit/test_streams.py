@@ -35,6 +35,7 @@ from quad_gym.records import (
     WIDTH,
     WORK_BLOCK,
     Act,
+    Aid,
     FaultKind,
     aligned_zeros,
     streams,
@@ -52,8 +53,8 @@ def test_sensor_with_many_blocks_has_draws_for_each(monkeypatch):
     ranges = list(DRAW_RANGES)
     monkeypatch.setattr(streams, "DRAW_RANGES", ranges)
     monkeypatch.setattr(streams, "AID_MOST", (*AID_MOST[:-1], 500))
-    (last,) = streams._claim_aids("a test", 30_000, 2, 0, each_block=True)[-1:]
-    assert ranges[-1] == ("a test: UWB_RANGE", last, 1000)
+    (last,) = streams._claim_aids("a test", 30_000, 2, 40, each_block=True)[-1:]
+    assert ranges[-1] == (f"a test: {list(Aid)[-1].name}", last, 1000)
     assert all(r.first + r.draws <= last or last + 1000 <= r.first for r in ranges[:-1])
 
 

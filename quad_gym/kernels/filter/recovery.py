@@ -135,9 +135,10 @@ def _confirmed(flight, p, settings, refused, bit):
 def supported(flight, p, settings, refused):
     """Lanes in which other sensors confirm all that the group `refused` measures.
 
-    Several blocks, as of an image, support themselves, so nothing overrules them.
+    Several blocks, as of an image, support themselves, so nothing overrules them. Blocks with a
+    common error state do not: the error is in all of them.
     """
-    if refused in SEVERAL:
+    if refused in SEVERAL and refused not in WITH_OWN_ERROR:
         return no_lane(flight.tick)
     return confirmed(flight, p, settings, refused)
 
