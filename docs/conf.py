@@ -37,6 +37,7 @@ suppress_warnings = [
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # notebooks are committed with their outputs
+nb_merge_streams = True  # prints of one cell are one block
 
 # single backticks in docstrings are names, with links to their documentation
 default_role = "py:obj"

@@ -104,7 +104,7 @@ def _value(value: Any) -> str:
         return "`RewardParams()`"
     if isinstance(value, tuple) and value:
         kinds = ", ".join(f"`{type(part).__name__}`" for part in value)
-        return f"{len(value)} of them" if isinstance(value[0], tuple) else kinds
+        return f"{len(value)} points" if isinstance(value[0], tuple) else kinds
     return f"`{value!r}`"
 
 
@@ -188,7 +188,7 @@ def _only(keyword: str) -> str:
     if keyword in ONE_TASK_FIELDS:
         return f". Only with `{ONE_TASK_FIELDS[keyword]}`"
     without = [kind for kind, keywords in FIELDS_WITHOUT_EFFECT.items() if keyword in keywords]
-    return f". Not with {' and '.join(f'`{kind}`' for kind in without)}" if without else ""
+    return f". Not with {', '.join(f'`{kind}`' for kind in without)}" if without else ""
 
 
 def _vehicles() -> str:
@@ -285,7 +285,8 @@ def _has_effect(keyword: str, kind: str) -> bool:
 
 def _keyword(name: str, default: str, meaning: str) -> str:
     """An item of a list of keywords, with the meaning, without its source, under the keyword."""
-    meaning = re.sub(r" \(report section [\d.]+\)|; report section [\d.]+", "", meaning)
+    meaning = re.sub(r" \(report section \d+(\.\d+)*\)|; report section \d+(\.\d+)*", "", meaning)
+    meaning = re.sub(r"^\(\d+,( \d+)?\) ", "", meaning)  # the shape, which the default shows
     return f"- `{name}` = {default}\\\n  {meaning[:1].upper()}{meaning[1:]}\n"
 
 
@@ -297,8 +298,8 @@ def _index_page() -> str:
     )
     pages = "\n".join([*quad_gym.IDS.values(), *(f"../{name}" for name in SHARED_PAGES)])
     return (
-        "# Environments by id\n\nEach page has the reference, start, reward and endings of an "
-        "environment, and the defaults in which it differs.\n\n"
+        "# Environments by id\n\nEach page has the reference, start and time limit of an "
+        "environment, and what differs from the specification that they share.\n\n"
         f"| page | id |\n| --- | --- |\n{ids}\n"
         "They share their [keywords](../keywords.md), [observations](../observations.md), "
         "[specification](../specification.md) and [parameters that can be "
@@ -312,6 +313,7 @@ def _suites_page() -> str:
     text = "# Sensor suite parameters\n\nThe fields of `quad_gym.SensorSuite`. Their meaning is "
     text += "under [Parameters](../api/parameters.md), their sources are beside the numbers in "
     text += "`quad_gym/params/`.\n"
+    text += "A table has the suites that differ, or have the sensor at all.\n"
     for part, kind in {
         "imu": quad_gym.ImuParams,
         **SENSOR_PARAMS,
@@ -320,16 +322,34 @@ def _suites_page() -> str:
         "noisy": quad_gym.NoisyObservationParams,
         "log_delays": quad_gym.LogDelays,
     }.items():
-        rows = []
+        having = {name: suite for name, suite in suites.items() if getattr(suite, part) is not None}
+        rows, same = [], []
         of_aids = dict.fromkeys(SENSOR_PARAMS, "[s]") if kind is quad_gym.LogDelays else {}
         said = _field_docs(kind, of_aids)
         for name in (field.name for field in dataclasses.fields(kind)):
-            of = (getattr(suite, part) for suite in suites.values())
-            values = ["-" if p is None else _value(getattr(p, name)) for p in of]
+            values = [_value(getattr(getattr(suite, part), name)) for suite in having.values()]
             unit = re.search(r"\[[^]\d][^]]*\]", said[name])  # not a range, such as [0, 1)
-            rows.append((f"`{name}`" + (f" {unit[0]}" if unit else ""), *values))
-        text += f"\n## `{part}`: {kind.__name__}\n\n{_table(('', *suites), rows)}"
+            row = (f"`{name}`" + (f" {unit[0]}" if unit else ""), *values)
+            if len(set(values)) == 1:
+                same.append(row[:2])
+            else:
+                rows.append(row)
+        text += f"\n## `{part}`: {kind.__name__}\n\n"
+        text += _columns(tuple(having), rows) if rows else ""
+        if same:
+            who = "all suites" if len(having) == len(suites) else ", ".join(having)
+            text += f"\n{_table(('', who), same)}"
     return text
+
+
+def _columns(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Table in which names with equal values share a column."""
+    shared: dict[tuple[str, ...], list[str]] = {}
+    for name, column in zip(names, list(zip(*rows, strict=True))[1:], strict=True):
+        shared.setdefault(column, []).append(name)
+    cells = zip(*shared, strict=True)
+    heads = ("", *(", ".join(each) for each in shared.values()))
+    return _table(heads, [(row[0], *values) for row, values in zip(rows, cells, strict=True)])
 
 
 def _fields_page() -> str:

@@ -33,7 +33,7 @@ def page() -> str:
 
 
 def _keywords(given: Mapping[str, Any]) -> str:
-    return ", ".join(f"`{name}={value}`" for name, value in given.items())
+    return ", ".join(f"`{name}={value!r}`" for name, value in given.items())
 
 
 def _method(recipe: Mapping[str, Any]) -> str:

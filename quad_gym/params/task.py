@@ -127,9 +127,9 @@ class TaskParams(Checked):
     out_of_bounds: check.Positive = 3.0
     """distance from the reference above which an episode ends [m]"""
     min_height: float = -0.5
-    """height below which an episode ends [m]; negative, as a vehicle without a launch pad sinks
-    while its rotors spin up. Over ground that supports vehicles (`WorldParams.ground`), at least
-    0.5 m below that ground"""
+    """height below which an episode ends [m]. The default is negative, as a vehicle without a
+    launch pad sinks while its rotors spin up. Over ground that supports vehicles
+    (`WorldParams.ground`), at least 0.5 m below that ground"""
     truncate_when_diverged: bool = False
     """True: truncate an episode when the filter's consistency monitor flags divergence"""
     max_tilt: float = math.radians(100.0)
@@ -139,7 +139,7 @@ class TaskParams(Checked):
     max_acceleration: check.Positive = 3.0
     """bound of the acceleration of a random trajectory [m/s^2]"""
     gate_count: Annotated[int, partial(check.whole, most=MAX_GATES)] = 5
-    """number of gates of a course, at most MAX_GATES"""
+    """number of gates of a course, at most 8"""
     gate_radius: check.Positive = 0.3
     """distance from the center of a gate below which the gate is passed [m]"""
     preview: Annotated[Vector, partial(check.vector, length=2, least=0.0)] = (0.2, 0.4)

@@ -98,7 +98,7 @@ TASKS: tuple[BenchTask, ...] = (
     ),
     BenchTask(
         name="RandomTrajectory",
-        asks="Control: with this estimate, training on the truth should be as good",
+        asks="Control: with this estimate, training on the truth should be at least as good",
         env_id="QuadGym/RandomTrajectory-v0",
         environment={"sensors": "consumer", "world": "breeze"},
         flights=("RandomTrajectory, consumer", "breeze"),

@@ -237,9 +237,10 @@ def stale_race_compensation(rows: Rows) -> str:
     return (
         f"If the filter compensates the delay in the test, the same policies pass all gates in "
         f"{arms.success(pair[0])} (trained on the truth) and {arms.success(pair[1])} (trained on "
-        f"the estimate without compensation). The success of policies that were trained on the "
-        f"truth changes by {arms.against(pair[0], 'truth')}, and then differs from policies that "
-        f"were trained and tested on the uncompensated estimate by {arms.against(pair[0], 'std')}."
+        f"the estimate and 15 standard deviations, without compensation). The success of policies "
+        f"that were trained on the truth changes by {arms.against(pair[0], 'truth')}, and then "
+        f"differs from that of policies that were trained and tested on the uncompensated estimate "
+        f"and its deviations by {arms.against(pair[0], 'std')}."
     )
 
 
