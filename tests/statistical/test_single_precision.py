@@ -139,6 +139,27 @@ def test_exported_filters_in_single_precision_equal_replays_in_it(suite):
     assert " passed" in told
 
 
+INTERFACES = """
+tests/contract/test_own_estimators.py tests/contract/test_pd_policy.py
+tests/contract/test_same_flights.py tests/contract/test_tasks.py tests/contract/test_torch_env.py
+tests/unit/test_flight_record.py tests/unit/test_replay_own.py
+"""
+TO_LAST_DIGITS = """
+documented_formula documented_spread distances_between no_hovering_start default_to_the_gyro
+of_its_flight_only controller_observes ukf_in_numpy consistency_command
+"""
+
+
+def test_interfaces_work_in_single_precision():
+    """Own estimators and tasks, policies, torch views, recordings, and replays with own estimators.
+
+    Without tests that compare with formulas to more digits than single precision has.
+    """
+    chosen = f"not ({' or '.join(TO_LAST_DIGITS.split())})"
+    words = ("-q", "-m", "not slow", "-k", chosen, *INTERFACES.split())
+    assert " passed" in flown(*words, module="pytest", QUAD_GYM_PRECISION="single")
+
+
 @pytest.mark.parametrize("lanes", SINGLE_WIDTHS[1:])
 def test_golden_flights_in_single_precision_do_not_depend_on_number_of_lanes(lanes):
     environment = {"QUAD_GYM_PRECISION": "single", "QUAD_GYM_LANES": str(lanes)}
