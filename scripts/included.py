@@ -2,7 +2,7 @@
 
     python -m scripts.included                        # all of them
     python -m scripts.included circle look_around     # some
-    python -m scripts.included look_around --seeds 2  # fewer seeds, for a trial
+    python -m scripts.included look_around --seeds 2 --pretrained results/trial  # a trial
 
 Of several seeds, the policy with the best validation is kept, as `baselines/pretrained/NAME.npz`.
 Each training is a folder in results/included: an interrupted command continues where it stopped.
@@ -11,45 +11,50 @@ Each training is a folder in results/included: an interrupted command continues 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
 from baselines.policies import PRETRAINED
-from baselines.recipes import IMITATION, Plan, recipe
+from baselines.recipes import Plan, recipe
 from baselines.training import TrainingResult, export, train
 from quad_gym.commands import options
 from quad_gym.params import checks as check
-
-_TRUTH = {"observation": "truth"}
-_LOOKS = {"task": "baselines.arm_tasks:WithStd"}
-_CERTAIN = {"task": "scripts.studies.arm_tasks:WithStdCertaintyReward"}
-_UNCERTAIN = {"task": "baselines.arm_tasks:WithUncertainty"}
-_FOR_RULE = {"task": "scripts.studies.arm_tasks:WithUncertaintyForRule", "include_std": True}
-_BACKS_OFF = {"teacher": "scripts.studies.rules:BacksOff"}
+from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, TRUTH, Arm, chosen_arms
 
 
-def _plan(task: str, algorithm: str = "ppo", evaluations: int = 20, **more: object) -> Plan:
+def _plan(task: str, arm: Arm | None = None, **more: Any) -> Plan:
+    """Plan of a task's recipe, or of an arm of its study."""
     env_id = f"QuadGym/{task}-v0"
-    chosen = {"recipe": recipe(env_id, algorithm), "engine": "compiled", **more}
-    return Plan(env_id=env_id, evaluations=evaluations, **chosen)  # type: ignore[arg-type]
+    if arm is None:
+        return Plan(env_id=env_id, recipe=recipe(env_id), engine="compiled", **more)
+    base = recipe(env_id, arm.algorithm)
+    return Plan(
+        env_id=env_id,
+        environment=arm.environment,
+        learning=arm.learning,
+        recipe=base.replace(parameters={**base.parameters, **arm.parameters}),
+        engine=arm.engine,
+        **more,
+    )
+
+
+_CAREFUL, *_ = chosen_arms(ARMS, ["std_certainty"])
+_STD, *_ = chosen_arms(STALE_RACE, ["std"])
+_IMITATION, *_ = chosen_arms(OUTAGE_DASH, ["imitation"])
 
 
 PLANS: Mapping[str, tuple[Plan, int]] = {
     "circle": (_plan("Circle"), 1),
-    "circle_truth": (_plan("Circle", environment=_TRUTH), 1),
+    "circle_truth": (_plan("Circle", environment=TRUTH), 1),
     "hover": (_plan("Hover"), 1),
     "lemniscate": (_plan("Lemniscate"), 1),
     "random_trajectory": (_plan("RandomTrajectory"), 1),
     "waypoints": (_plan("Waypoints"), 1),
-    "look_around": (_plan("LookAround", "ppo", 9, environment=_LOOKS, learning=_CERTAIN), 3),
-    "look_around_truth": (_plan("LookAround", "ppo", 9, environment=_TRUTH), 1),
-    "stale_race": (_plan("StaleRace", "ppo", 8, environment={"include_std": True}), 20),
-    "outage_dash": (
-        _plan("OutageDash", IMITATION, 2, environment=_UNCERTAIN, learning=_FOR_RULE).replace(
-            recipe=recipe("QuadGym/OutageDash-v0", IMITATION).replace(parameters=_BACKS_OFF)
-        ),
-        10,
-    ),
+    "look_around": (_plan("LookAround", _CAREFUL, evaluations=9), 3),
+    "look_around_truth": (_plan("LookAround", environment=TRUTH, evaluations=9), 1),
+    "stale_race": (_plan("StaleRace", _STD, evaluations=8), 20),
+    "outage_dash": (_plan("OutageDash", _IMITATION, evaluations=2), 10),
 }
 """Plan of each policy, and the number of seeds of which the best validation is kept."""
 
@@ -85,6 +90,8 @@ def main(args: IncludedArgs) -> None:
     """Train the policies, and write their files."""
     for name in args.names:
         check.choice("names", name, tuple(PLANS))
+    if args.seeds is not None:
+        check.whole("--seeds", args.seeds)
     for name in args.names:
         best = best_of(name, args.output, args.seeds)
         export(best, file := args.pretrained / f"{name}.npz")

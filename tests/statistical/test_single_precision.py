@@ -69,14 +69,19 @@ print(json.dumps({
 """
 
 
-def test_replay_in_single_precision_agree_with_double(tmp_path):
-    results = []
+def printed_in_both(program, folder):
+    """Output of a program that reads a log, in double and in single precision."""
+    told = []
     for precision in ("double", "single"):  # the first one writes the log
-        words = ("-c", REPLAY, str(tmp_path / "log.csv"))
+        words = ("-c", program, str(folder / "log.csv"))
         done = run_python(*words, QUAD_GYM_PRECISION=precision)
         assert done.returncode == 0, done.stderr
-        results.append(json.loads(done.stdout))
-    double, single = results
+        told.append(done.stdout)
+    return told
+
+
+def test_replay_in_single_precision_agree_with_double(tmp_path):
+    double, single = map(json.loads, printed_in_both(REPLAY, tmp_path))
     np.testing.assert_allclose(single["position"], double["position"], atol=1e-3)
     np.testing.assert_allclose(single["velocity"], double["velocity"], atol=1e-3)
     np.testing.assert_allclose(single["sigma"], double["sigma"], rtol=1e-2)
@@ -116,14 +121,9 @@ print(numbers)
 
 def test_calibration_in_single_precision_has_the_bits_of_double(tmp_path):
     """The fit of a vehicle, too, and the sentences on progress."""
-    told = []
-    for precision in ("double", "single"):  # the first one writes the log
-        words = ("-c", CALIBRATION, str(tmp_path / "log.csv"))
-        done = run_python(*words, QUAD_GYM_PRECISION=precision)
-        assert done.returncode == 0, done.stderr
-        told.append(done.stdout)
-    assert told[0] == told[1]
-    assert "Computing intervals" in told[0]
+    double, single = printed_in_both(CALIBRATION, tmp_path)
+    assert double == single
+    assert "Computing intervals" in double
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
