@@ -7,7 +7,8 @@ text is drawn at four times its size, which spaces letters evenly.
 
 import contextlib
 import io
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -48,6 +49,7 @@ Label = tuple[str, Floats, Color]  #: text, its place (2,) [pixels], and its col
 Mark = tuple[Literal["line", "cross", "box"], Color]  #: shape and color of a part in a legend
 
 OVERSAMPLING, TEXT_OVERSAMPLING = 2, 4
+TILE = 32  #: side of the tiles that are halved and restored where something was drawn [pixels]
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
 _RGBA = (0xFF, 0xFF00, 0xFF0000, 0xFF000000)
 """Bytes of a pixel in memory: red, green, blue, and an unused one, or the opacity. Pygame blends
@@ -77,6 +79,9 @@ class Canvas:
         self.surface = self._pygame.Surface((width, height), 0, 32, _RGBX)
         self._packed = self._pygame.Surface((width, height), 0, 24, _RGBX)
         self._background: Any = None
+        self._halved: Any = None
+        self._drawn = np.zeros((-(-size[1] // TILE), 2 + -(-size[0] // TILE)), bool)
+        """Tiles of the large surface that differ from the background, between two empty columns."""
         self._panel: tuple[Any, Any] = (None, None)
         self._fonts: dict[int, Any] = {}
         self._words: dict[tuple[str, int, Color], Any] = {}
@@ -93,24 +98,30 @@ class Canvas:
 
     def keep_background(self) -> None:
         """Store the picture so far, as the background of later pictures."""
-        self._background = self._large.copy()
+        self.finish()
+        self._background, self._halved = self._large.copy(), self.surface.copy()
+        self._drawn[:] = False
 
     def show_background(self) -> None:
-        """Copy the stored background."""
-        self._large.blit(self._background, (0, 0))
+        """Copy the stored background, where the last picture differs from it."""
+        for box in self._boxes():
+            self._large.blit(self._background, box, box)
+        self.surface.blit(self._halved, (0, 0))
+        self._drawn[:] = False
 
     def line(self, points: Floats, color: Color, width: float = 1.0, closed: bool = False) -> None:
         """Draw a line through points (n, 2) [pixels], interrupted at points that are NaN."""
         for run in _runs(points):
             if len(run) > 1:
                 thickness = max(1, round(OVERSAMPLING * width))
-                self._pygame.draw.lines(self._large, color, closed, _large(run), thickness)
+                points = _large(run)
+                self._touch(self._pygame.draw.lines(self._large, color, closed, points, thickness))
 
     def segments(self, segments: Floats, color: Color, width: float = 1.0) -> None:
         """Draw line segments (n, 2, 2) [pixels]."""
         thickness = max(1, round(OVERSAMPLING * width))
         for start, end in _large(segments):
-            self._pygame.draw.line(self._large, color, start, end, thickness)
+            self._touch(self._pygame.draw.line(self._large, color, start, end, thickness))
 
     def dashes(
         self, points: Floats, color: Color, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
@@ -135,18 +146,19 @@ class Canvas:
         """Draw a filled polygon with corners (n, 2) [pixels], unless one of them is NaN."""
         if len(points) < 3 or not np.isfinite(points).all():
             return
-        corners = _large(points)
+        places = (OVERSAMPLING * points).clip(-_FAR, _FAR)
+        corners = places.tolist()
         if opacity >= 1.0:
-            self._pygame.draw.polygon(self._large, color, corners)
+            self._touch(self._pygame.draw.polygon(self._large, color, corners))
             return
-        low = np.floor(np.array(corners).min(axis=0)).astype(int)
-        size = np.ceil(np.array(corners).max(axis=0)).astype(int) - low + 1
-        box = self._large.get_clip().clip((*low.tolist(), *size.tolist()))
+        left, top = map(math.floor, places.min(axis=0).tolist())
+        right, bottom = map(math.ceil, places.max(axis=0).tolist())
+        box = self._large.get_clip().clip((left, top, right - left + 1, bottom - top + 1))
         if box.width and box.height:
             self._layer.set_clip(box)
             self._layer.fill((*color, 0))
             self._pygame.draw.polygon(self._layer, (*color, round(255 * opacity)), corners)
-            self._large.blit(self._layer, box, box)
+            self._touch(self._large.blit(self._layer, box, box))
 
     def disc(self, at: Floats, radius: float, color: Color, width: float = 0.0) -> None:
         """Draw a disc, or a ring of a given width [pixels], around a point (2,)."""
@@ -154,7 +166,8 @@ class Canvas:
             n = OVERSAMPLING
             (center,) = _large(at[np.newaxis])
             ring = round(n * width) if width else 0
-            self._pygame.draw.circle(self._large, color, center, max(1.0, n * radius), ring)
+            radius = max(1.0, n * radius)
+            self._touch(self._pygame.draw.circle(self._large, color, center, radius, ring))
 
     def crosses(self, at: Floats, size: float, color: Color, width: float = 1.5) -> None:
         """Draw diagonal crosses at points (n, 2) [pixels] that are not NaN."""
@@ -169,18 +182,36 @@ class Canvas:
         """Draw a filled rectangle, or its border with a line width `line` [pixels]."""
         n = OVERSAMPLING
         rectangle = [round(n * x) for x in (left, top, width, height)]
-        self._pygame.draw.rect(self._large, color, rectangle, round(n * line))
+        self._touch(self._pygame.draw.rect(self._large, color, rectangle, round(n * line)))
 
     def inside(self, box: tuple[float, float, float, float] | None) -> None:
         """Clip drawing to a rectangle (left, top, width, height) from now on; None: no clipping."""
         n = OVERSAMPLING
         self._large.set_clip(None if box is None else [round(n * x) for x in box])
 
+    def _touch(self, box: Any) -> None:
+        """Note that a rectangle of the large surface was drawn on."""
+        if box.width and box.height:
+            rows = slice(box.top // TILE, -(-box.bottom // TILE))
+            self._drawn[rows, 1 + box.left // TILE : 1 - (-box.right // TILE)] = True
+
+    def _boxes(self) -> Iterator[Any]:
+        """Rectangles of the large surface that cover all tiles that were drawn on."""
+        whole, columns = self._large.get_rect(), self._drawn.shape[1]
+        flat = self._drawn.reshape(-1)
+        edges = 1 + np.flatnonzero(flat[1:] != flat[:-1])
+        for first, end in edges.reshape(-1, 2).tolist():
+            row, column = divmod(first, columns)
+            yield whole.clip((TILE * (column - 1), TILE * row, TILE * (end - first), TILE))
+
     # ---- text ---------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Halve the picture; only text can be drawn after this."""
-        self._pygame.transform.smoothscale(self._large, (self.width, self.height), self.surface)
+        """Halve the picture where it was drawn on; only text can be drawn after this."""
+        for box in self._boxes():
+            part = [side // OVERSAMPLING for side in box]
+            halved = self.surface.subsurface(part)
+            self._pygame.transform.smoothscale(self._large.subsurface(box), part[2:], halved)
 
     def veil(self, left: float, top: float, width: float, height: float) -> None:
         """Brighten a rectangle of the finished picture, for text to stand out."""

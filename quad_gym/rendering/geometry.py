@@ -53,8 +53,9 @@ class Perspective:
 
     def segments(self, starts: Floats, ends: Floats) -> Floats:
         """Pixels (m, 2, 2) of line segments, (n, 3) or (3,) each, clipped where too near."""
-        pairs = np.broadcast_arrays(np.atleast_2d(starts), np.atleast_2d(ends))
-        both = self.in_view(np.stack(pairs, axis=1))
+        count = len(starts) if starts.ndim == 2 else len(ends) if ends.ndim == 2 else 1
+        both = np.empty((count, 2, 3))
+        both[:, 0], both[:, 1] = self.in_view(starts), self.in_view(ends)
         in_front = both[..., 2] > NEAR
         if in_front.all():
             return self.flatten(both)
