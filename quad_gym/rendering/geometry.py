@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 NEAR = 0.05  #: distance from the viewing camera below which objects are not drawn [m]
 AROUND = 6.0  #: distance from reference and start within which a fixed view shows obstacles [m]
+ASTRAY = 3.0  #: distance from the scene up to which a fixed view shows the path of a vehicle [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +140,22 @@ def fit_view(
     return Perspective(eye @ axes, axes, focal, center)
 
 
-def fixed_view(flight: Flight, width: float, height: float) -> Perspective:
-    """View (width, height) [pixels] of the whole reference, the start, and the markers."""
+def fixed_view(
+    flight: Flight,
+    width: float,
+    height: float,
+    top: float = 0.0,
+    path_I: Floats | None = None,
+) -> Perspective:
+    """View (width, height) [pixels] of the whole reference, the start, and the markers.
+
+    Args:
+        flight: Flight to show.
+        width: Width of the picture [pixels].
+        height: Height of the picture [pixels].
+        top: Height of a legend, below which these are shown [pixels].
+        path_I: Positions of vehicles that are shown as well, unless they go astray, (n, 3) [m].
+    """
     scene, start = flight.scene, flight["position"][0]
     times = np.linspace(0.0, scene.reference_period or 1.0, max(64, scene.pieces // 4))
     around = [scene.reference(times), start[np.newaxis], scene.gates_I, scene.features_I]
@@ -152,9 +167,14 @@ def fixed_view(flight: Flight, width: float, height: float) -> Perspective:
         low, high = scene.geofence_I if len(scene.geofence_I) else (low, high)
         places = np.clip(scene.obstacles[:, 1:4], low, high)
         points = np.concatenate([points, places * (1.0, 1.0, 0.0), places])
+    if path_I is not None:  # a vehicle that flies away must not make all the rest small
+        path_I = path_I[np.isfinite(path_I).all(axis=1)]
+        near = np.clip(path_I, points.min(axis=0) - ASTRAY, points.max(axis=0) + ASTRAY)
+        points = np.concatenate([points, near])
     pad = 0.45 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
     corners = (points[:, np.newaxis] + pad).reshape(-1, 3)
-    low = np.array([0.03 * width, 0.24 * height])  # legend and inset fill the upper corners
+    share = min(max(0.24, top / height), 0.6)  # legend and inset fill the upper corners
+    low = np.array([0.03 * width, share * height])
     high = np.array([0.97 * width, 0.97 * height])
     azimuth, elevation = np.radians(-62.0), np.radians(24.0)
     return fit_view(corners, azimuth, elevation, 1.15 * width, low, high)

@@ -51,6 +51,8 @@ class Renderer:
             along a course of obstacles, without the reference).
         size: Width and height [pixels].
         legend: True to show task, time, legend and errors, and the image of the camera.
+        path_I: Positions of a whole flight, (n, 3) in I [m], which a fixed view then contains. A
+            vehicle that leaves the reference stays in the picture for 3 m.
 
     Raises:
         ValueError: If an argument is invalid.
@@ -58,9 +60,14 @@ class Renderer:
     """
 
     def __init__(
-        self, view: str = "fixed", size: tuple[int, int] = (640, 480), *, legend: bool = True
+        self,
+        view: str = "fixed",
+        size: tuple[int, int] = (640, 480),
+        *,
+        legend: bool = True,
+        path_I: NDArray[np.float64] | None = None,
     ) -> None:
-        self._legend = legend
+        self._legend, self._path_I = legend, path_I
         self.view = check.choice("render_view", view, ("fixed", *MOVING_VIEWS))
         self.size = checked_size(size)
         width, height = self.size
@@ -105,14 +112,26 @@ class Renderer:
         return canvas.pixels()
 
     def __reduce__(self) -> Any:
-        return partial(Renderer, legend=self._legend), (self.view, self.size)
+        made = partial(Renderer, legend=self._legend, path_I=self._path_I)
+        return made, (self.view, self.size)
 
     def _view_of(self, flight: Flight) -> Perspective:
+        """Perspective in which the last instant of a flight is drawn."""
         if self.view != "fixed":
             return MOVING_VIEWS[self.view](flight, *self.size)
         if self._scene is not flight.scene:
-            self._fixed = fixed_view(flight, *self.size)
+            top = self._legend_bottom(len(_legend_lines(flight)) + 1) if self._legend else 0.0
+            self._fixed = fixed_view(flight, *self.size, top, self._path_I)
         return self._fixed
+
+    def _legend_bottom(self, lines: int) -> float:
+        """Bottom of a legend with a number of lines below its title [pixels]."""
+        return 6.0 + self._line_top(lines) + 3.0
+
+    def _line_top(self, k: int) -> float:
+        """Top of the k-th line of the legend, in its panel [pixels]."""
+        canvas, large, small = self._canvas, self._text + 2, self._text - 1
+        return 5.0 + canvas.line_height(large) + (canvas.line_height(small) + 2) * k
 
     def _draw_background(self, flight: Flight, scene: Scene) -> None:
         """Draw the background, which a fixed view stores."""
@@ -130,16 +149,12 @@ class Renderer:
         name = str(flight.about.get("task", flight.scene.task)).replace("_", " ").title()
         title = f"{name.replace(' ', '')}, {_SEEN[flight.scene.observation]}"
         clock = f"{flight['time'][-1]:.2f} s"
-        policy = flight.about.get("policy")
-        lines: list[tuple[str, Mark | None]] = []
-        lines += [(_controller(str(policy)), None)] if policy else []
-        lines += [*legend_of(flight), (errors := errors_of(flight), None)]
-        lines += [(words, None) for words in _warnings(flight)]
+        errors = errors_of(flight)
+        lines = [*_legend_lines(flight), *((words, None) for words in _warnings(flight))]
         width = max(26 + canvas.width_of(words, small) for words, _ in lines)
         head = (canvas.width_of(words, large) for words in (title, "   ", clock))
         width = -(-max(width, sum(head) + 12) // _GRAIN) * _GRAIN
-        step, first = canvas.line_height(small) + 2, 5.0 + canvas.line_height(large)
-        places = {words: first + step * k for k, (words, _) in enumerate(lines)}
+        places = {words: self._line_top(k) for k, (words, _) in enumerate(lines)}
 
         def write() -> None:  # without what changes in each picture
             canvas.text(title, 6, 3, large)
@@ -150,9 +165,16 @@ class Renderer:
                     canvas.text(words, 6 if mark is None else 21, places[words], small)
 
         key = (title, width, *((words, mark) for words, mark in lines if words != errors))
-        canvas.panel(key, (6, 6), (width, first + 3 + step * len(lines)), write)
+        canvas.panel(key, (6, 6), (width, self._legend_bottom(len(lines)) - 6.0), write)
         canvas.text(clock, width, 9, large, colors.INK, 1.0)
         canvas.text(errors, 12, 6 + places[errors], small)
+
+
+def _legend_lines(flight: Flight) -> list[tuple[str, Mark | None]]:
+    """Lines of the legend below its title, without warnings."""
+    policy = flight.about.get("policy")
+    lines: list[tuple[str, Mark | None]] = [(_controller(str(policy)), None)] if policy else []
+    return [*lines, *legend_of(flight), (errors_of(flight), None)]
 
 
 def _controller(policy: str) -> str:

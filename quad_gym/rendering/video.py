@@ -125,7 +125,7 @@ def save_video(
     """
     target = checked_video_path(path, fps)
     times = times_of(float(flight["time"][-1]), fps, speed, progress)
-    renderer = Renderer(view, checked_size(size))
+    renderer = Renderer(view, checked_size(size), path_I=flight["position"])
     frames = (renderer.draw(flight.until(t)) for t in times)
     write_frames(frames, target, fps=fps)
     return target
@@ -301,7 +301,9 @@ class SideBySide:
         views = [_view_of(side.flight) for side in sides]
         self._on_course = "course" in views
         size = (width, height - BAND - LEGEND)
-        self._renderers = [Renderer(view, size, legend=False) for view in views]
+        path_I = np.concatenate([side.flight["position"] for side in sides])
+        # both views of a scene are the same, and contain both flights
+        self._renderers = [Renderer(view, size, legend=False, path_I=path_I) for view in views]
         self._band = Canvas(width, BAND)
         self._legend = Canvas(width * len(sides), LEGEND)
 

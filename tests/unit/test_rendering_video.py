@@ -7,7 +7,6 @@ import quad_gym
 from quad_gym.faults import GnssOutliers
 from quad_gym.records import GateDecision
 from quad_gym.rendering import Renderer, canvas, record_flight, save_video, tile
-from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.scene import inset_box, last_image, place_in_inset
 from tests.builders import Still
 
@@ -27,15 +26,45 @@ def color_near(frame, at, radius, color, tolerance=40):
 
 
 def test_features_and_reference_are_drawn_where_they_project(flight):
-    frame = Renderer("fixed", (640, 480)).draw(flight)
-    view = fixed_view(flight, 640, 480)
+    renderer = Renderer("fixed", (640, 480))
+    frame, view = renderer.draw(flight), renderer._view_of(flight)
     for feature in flight.scene.features_I:
         assert color_near(frame, view.project(feature)[0], 5, canvas.INK, 90)  # perhaps an outline
     assert color_near(frame, view.project(flight["position"][-1])[0], 25, canvas.BLUE)
     start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m too low
-    frame = Renderer("fixed", (640, 480)).draw(start)
-    at = fixed_view(start, 640, 480).project(start["reference_position"][-1])[0]
+    renderer = Renderer("fixed", (640, 480))
+    frame = renderer.draw(start)
+    at = renderer._view_of(start).project(start["reference_position"][-1])[0]
     assert color_near(frame, at, 8, canvas.GREEN)
+
+
+@pytest.mark.parametrize("task", ["Circle", "Trajectory"])
+@pytest.mark.parametrize("size", [(320, 240), (480, 360), (640, 480)])
+def test_the_legend_hides_nothing_of_the_reference(task, size):
+    options = {"max_episode_steps": 1, "about": {"policy": "pd"}}
+    flight = record_flight(Still(), f"QuadGym/{task}-v0", **options)
+    scene, shown, plain = flight.scene, Renderer("fixed", size), Renderer("fixed", size)
+    reference = scene.reference(np.linspace(0.0, scene.reference_period, 200))
+    pixels = shown._view_of(flight).project(reference)[0]
+    plain._write_legend = lambda flight: None
+    rows = np.flatnonzero((shown.draw(flight) != plain.draw(flight)).any(axis=(1, 2)))
+    assert (pixels > (0.0, rows.max())).all()
+    assert (pixels < size).all()
+
+
+def test_a_film_shows_the_whole_path_and_loses_only_a_vehicle_that_goes_astray(flight):
+    away = flight["position"].copy()
+    away[:, 0] += np.linspace(0.0, 2.9, len(away))
+    view = Renderer("fixed", (640, 480), path_I=away)._view_of(flight)
+    pixels = view.project(away)[0]
+    assert ((pixels > 0.0) & (pixels < (640.0, 480.0))).all()
+    cut = Renderer("fixed", (640, 480))._view_of(flight).project(away)[0]
+    assert not ((cut > 0.0) & (cut < (640.0, 480.0))).all()
+    away[-1] = 1e6
+    far = Renderer("fixed", (640, 480), path_I=away)._view_of(flight)
+    away[-1] = np.nan
+    assert np.linalg.norm(far.eye) < 3.0 * np.linalg.norm(view.eye)
+    assert np.isfinite(Renderer("fixed", (640, 480), path_I=away)._view_of(flight).eye).all()
 
 
 def test_the_inset_is_drawn_where_the_camera_measured(flight):
@@ -62,7 +91,7 @@ def test_rejected_fix_is_drawn_in_gray():
     faults = GnssOutliers(share=1.0, size=100.0, start=0.3)
     options = {"sensors": "rtk", "faults": faults, "max_episode_steps": 30}
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
-    view = fixed_view(flight, 640, 480)
+    view = Renderer("fixed", (640, 480))._view_of(flight)
     measured = np.flatnonzero(np.isfinite(flight["gnss_position"][:, 0]))
     decisions = flight["gnss_decision"][measured[[2, -1]], 0].tolist()
     assert decisions == [GateDecision.ACCEPTED, GateDecision.REJECTED]
