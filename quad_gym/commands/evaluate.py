@@ -343,7 +343,8 @@ def main(args: EvaluateArgs) -> None:
         cases, folder = configure(args)
     began = time.perf_counter()
     bar = tqdm(cases.items(), desc="evaluating", unit=" cases")
-    results = {case: fly(policy, env, args.seed) for case, (policy, env) in bar}
+    with options.filter_hints(), bar:
+        results = {case: fly(policy, env, args.seed) for case, (policy, env) in bar}
     print(
         f"\n{args.env_id}, sensors {options.sensors_of(args.env_id, args.sensors)}; "
         f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"

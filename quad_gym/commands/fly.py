@@ -209,7 +209,8 @@ def main(args: FlyArgs) -> None:
         args = options.with_full_id(args)
         flights = flights_of(args)
     if args.output:
-        *_, flight = flights(args.seed)
+        with options.filter_hints():
+            *_, flight = flights(args.seed)
         for file in write(flight, args.output, args):
             print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
         return
@@ -220,6 +221,7 @@ def main(args: FlyArgs) -> None:
             hint = "without a display, --output writes a video instead"
             raise OSError(f"{error}; {hint}") from None
     for seed in itertools.count(args.seed):
-        watch(flights(seed), args, window)
+        with options.filter_hints():
+            watch(flights(seed), args, window)
         if window.closed:
             break

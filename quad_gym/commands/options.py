@@ -214,6 +214,26 @@ def usage_errors(
         raise SystemExit(USAGE_ERROR) from None
 
 
+@contextmanager
+def filter_hints() -> Iterator[None]:
+    """Context that turns the error of a task that lacks the filter into a usage error."""
+    from quad_gym.tasks import TaskError
+    from quad_gym.tasks.view import MissingFilterError
+
+    try:
+        yield
+    except TaskError as error:
+        if not isinstance(error.__cause__, MissingFilterError):
+            raise  # the traceback shows the line of the user's task
+        method = str(error).partition(" failed")[0]
+        with usage_errors():
+            raise ValueError(
+                f"{method} needs the filter, which does not run for this observation: use "
+                "--observation estimate, or --env run_filter=true, with which it runs next to the "
+                "true state"
+            ) from None
+
+
 _OF_COMMANDS = ("num_envs", "autoreset_mode", "render_mode")
 """Arguments of vector environments that are no keywords of `--env`."""
 

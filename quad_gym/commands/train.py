@@ -104,7 +104,7 @@ def main(args: TrainArgs) -> None:
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
     )
-    with options.usage_errors((RunError,)):
+    with options.usage_errors((RunError,)), options.filter_hints():
         done = train(
             plan, folder, resume=args.resume, tensorboard=args.tensorboard, quiet=not args.progress
         )

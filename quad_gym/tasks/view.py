@@ -248,12 +248,16 @@ def _block(first: int, unit: str, frame: str, of: str) -> tuple[GroupField[Float
     return covariance, sigma
 
 
+class MissingFilterError(ValueError):
+    """Error raised if a task reads the filter or its sensors where they do not run."""
+
+
 class EstimateView(Group):
     """Estimate of the filter and its covariance."""
 
     def _require(self) -> None:
         if not self._flights.run_filter:
-            raise ValueError(
+            raise MissingFilterError(
                 'view.estimate needs a filter: observation="estimate" or "measurements", or '
                 "run_filter=True, include_std=True or innovations=True"
             )
@@ -400,7 +404,7 @@ class MeasuredView(Group):
 
     def _require(self) -> None:
         if not self._flights.run_filter:
-            raise ValueError(
+            raise MissingFilterError(
                 'view.measured needs simulated sensors: observation="estimate" or "measurements", '
                 "or run_filter=True, include_std=True or innovations=True"
             )

@@ -181,6 +181,24 @@ def test_command_line_flies_a_task_of_the_working_directory(tmp_path):
     assert case["return"] == 5.0
 
 
+@pytest.mark.parametrize("command", ["evaluate", "fly"])
+def test_commands_name_the_option_with_which_the_filter_of_a_reward_runs(command, tmp_path):
+    (tmp_path / "uncertain.py").write_text(
+        "import quad_gym\nfrom quad_gym import rewards\n"
+        'Uncertain = quad_gym.Task.of(reward=rewards.Uncertainty("position"))\n'
+    )
+    words = f"{command} QuadGym/Hover-v0 --policy pd --observation truth --overwrite --output "
+    words += {"evaluate": "out --episodes 2", "fly": "flight.npz"}[command]
+    words += " --env task=uncertain:Uncertain max_episode_steps=3"
+    done = console_commands.run(*words.split(), where=tmp_path)
+    assert done.returncode == 2
+    said = done.stderr.strip().splitlines()[-1]
+    assert said.startswith("error: Task.reward needs the filter")
+    assert "--observation estimate" in said
+    done = console_commands.run(*words.split(), "run_filter=true", where=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_rendering_and_recording_take_a_task():
     pytest.importorskip("pygame")
     env = gymnasium.make("QuadGym/Hover-v0", task=Half(), render_mode="rgb_array")
