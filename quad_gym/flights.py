@@ -409,7 +409,7 @@ def table(rows: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
             found |= {name: sigmas[:, k] for k, name in enumerate(names)}
         elif values.ndim == 3:
             for k, j in np.ndindex(values.shape[1:]):
-                found[f"{column.name}_{k + 1}_{'xyz'[j]}"] = values[:, k, j]
+                found[f"{column.name}_{k}_{'xyz'[j]}"] = values[:, k, j]
         elif values.ndim == 1:
             found[column.name] = values
         else:
@@ -423,7 +423,7 @@ def _parts(column: Column, count: int) -> Sequence[str]:
     if column.labels:
         return column.labels
     if column.several or column.name in ("action", "rotor_speeds"):
-        return [str(k + 1) for k in range(count)]
+        return [str(k) for k in range(count)]
     return ("wxyz" if column.name.endswith("quaternion") else "xyz")[:count]
 
 
@@ -486,7 +486,10 @@ class Flight:
         return cls(*load_flight(Path(path)))
 
     def to_csv(self, path: Path | str) -> Path:
-        """Write a table for spreadsheets, with the covariance's standard deviations."""
+        """Write a table for spreadsheets, with the covariance's standard deviations.
+
+        Parts of a column end in an axis or in a number from 0, as `pixels_0_x` and `action_3`.
+        """
         file = Path(path)
         file.parent.mkdir(parents=True, exist_ok=True)
         return write_csv(file, table(self.rows))

@@ -92,13 +92,13 @@ class _Log:
             path = scene.reference(np.linspace(0.0, scene.reference_period, 81 + scene.pieces))
             self._static("world/reference/path", rr.LineStrips3D([path], colors=[NEUTRAL]))
         if count := len(scene.gates_I):
-            sizes, labels = np.full((count, 3), scene.gate_radius), _numbers(count)
+            sizes, labels = np.full((count, 3), scene.gate_radius), _numbers(count, first=1)
             style = {"colors": [REFERENCE], "labels": labels}
             gates = rr.Ellipsoids3D(centers=scene.gates_I, half_sizes=sizes, **style)
             self._static("world/gates", gates)
         self._obstacles()
         if scene.has_camera:
-            style = {"colors": [NEUTRAL], "labels": _numbers(len(scene.features_I))}
+            style = {"colors": [NEUTRAL], "labels": _numbers(len(scene.features_I), first=0)}
             self._static("world/features", rr.Points3D(scene.features_I, radii=0.04, **style))
 
     def _obstacles(self) -> None:
@@ -269,8 +269,8 @@ class _Log:
         colors = (TRUTH, ESTIMATE, REFERENCE, FIX)
         for k, color in enumerate(colors):
             speed = flight["rotor_speeds"][:, k]
-            self._plot(f"rotors/{k + 1}", speed, color, f"rotor {k + 1} [rad/s]")
-            self._plot(f"actions/{k + 1}", flight["action"][:, k], color, f"action {k + 1}")
+            self._plot(f"rotors/{k}", speed, color, f"rotor {k} [rad/s]")
+            self._plot(f"actions/{k}", flight["action"][:, k], color, f"action {k}")
 
     def _plot(self, name: str, values: Floats, color: tuple[int, ...], words: str) -> None:
         entity = f"plots/{name}"
@@ -319,8 +319,8 @@ def _blueprint(flight: Flight) -> rrb.Blueprint:
     )
 
 
-def _numbers(count: int) -> list[str]:
-    return [str(k + 1) for k in range(count)]
+def _numbers(count: int, first: int) -> list[str]:
+    return [str(first + k) for k in range(count)]
 
 
 def _xyzw(q: Floats) -> Floats:

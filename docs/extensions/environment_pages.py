@@ -365,7 +365,9 @@ def _fields_page() -> str:
     columns = [row(column.name, column.shape, column) for column in COLUMNS]
     return (
         "# Fields of flights\n\n## Columns of a recorded flight\n\nColumns of `quad_gym.Flight`, "
-        "with a row for each control step.\n\n"
+        "with a row for each control step. Markers, anchors, rotors, motors and actions are "
+        "counted from 0, in arrays and in names such as `uwb_range_0` of logs, tables and "
+        "observations. Gates are counted from 1, in the order in which they are passed.\n\n"
         + _table(("column", "shape of a row", "unit", "frame", "meaning"), columns)
         + "\n## Quantities of a batch of flights\n\nNames of `FlightBatch.read`, with the flights "
         "as first axis.\n\n"

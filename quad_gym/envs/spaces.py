@@ -108,7 +108,7 @@ def _sensor_fields(suite: SensorSuite) -> tuple[Part, ...]:
     for name, reading in READINGS.items():
         count = suite.blocks_of(name) or int(reading.marked)
         for k in range(count):
-            block = reading.name_of(k + reading.raw_first)
+            block = reading.name_of(k)
             fields.append((block, reading.length, *reading.raw))
             fields.append((f"{block}_valid", 1, "0 or 1", "-", _FLAG))
     return (*fields, *_REFERENCE)

@@ -69,7 +69,6 @@ class ReadingDefinition(NamedTuple):
     sigma: str  #: keyword of a measurement's own standard deviation, per axis, in `sigma_unit`
     sigma_unit: str
     most_blocks: int = 1  #: largest number of blocks
-    raw_first: int = 0  #: number of the first of several blocks in raw observations
     block: str = ""  #: word for one of several blocks; empty: the name
     word: str = ""  #: short name in reports of one sensor; empty: that of a block
     direction: bool = False

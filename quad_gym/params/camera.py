@@ -74,7 +74,6 @@ class CameraParams(SensorBase):
             noise="pixel_sigma",
             sigma_unit="pixels",
             most_blocks=MAX_FEATURES,
-            raw_first=1,
             block="feature",
             direction=True,
         ),

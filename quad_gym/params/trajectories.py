@@ -219,7 +219,7 @@ def _checked(
             (f"a body rate about {axis}", rates[:, k], "rad/s", 0.0, max_rates[k])
             for k, axis in enumerate("xyz")
         ]
-    demands += [(f"a force of rotor {k + 1}", force[:, k], "N", 0.0, largest) for k in range(4)]
+    demands += [(f"a force of rotor {k}", force[:, k], "N", 0.0, largest) for k in range(4)]
     _refuse_excess(trajectory, demands, times, name)
     return Demand(
         thrust=(float(motion.thrust.min()), float(motion.thrust.max())),

@@ -107,7 +107,7 @@ class Inset:
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
                 x, y = place_in_inset(image["pixels"][k], self._scene, box)
-                canvas.text(str(k + 1), x + 8.0, y - 6.0, self._size - 2)
+                canvas.text(str(k), x + 8.0, y - 6.0, self._size - 2)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -151,12 +151,12 @@ def test_measurements_come_with_flags_at_their_own_rates():
     flags = []
     for _ in range(21):
         seen = parts_of(observation, observation="measurements")
-        for name in ("gnss_position", "gnss_baseline", "feature_1", "feature_2"):
+        for name in ("gnss_position", "gnss_baseline", "feature_0", "feature_1"):
             off = seen[f"{name}_valid"][:, 0] == 0.0
             assert set(np.unique(seen[f"{name}_valid"])) <= {0.0, 1.0}
             assert not seen[name][off].any()
             assert seen[name][~off].any(axis=1).all()
-        flags.append((seen["gnss_position_valid"][0, 0], seen["feature_2_valid"][0, 0]))
+        flags.append((seen["gnss_position_valid"][0, 0], seen["feature_1_valid"][0, 0]))
         observation, *_ = env.step(np.zeros((4, 4)))
     gnss, camera = np.array(flags).T
     np.testing.assert_array_equal(np.flatnonzero(gnss), [0, 5, 10, 15, 20])
@@ -240,10 +240,10 @@ def test_observed_measurements_equal_records_of_sensors():
     valid = batch.record("block_valid")[:, FEATURE_SLICE] > 0.0
     assert valid.any()
     for k in range(len(suite.camera.features_I)):
-        shown = seen[f"feature_{k + 1}"] * np.array(suite.camera.image_size) / 2
+        shown = seen[f"feature_{k}"] * np.array(suite.camera.image_size) / 2
         expected = np.where(valid[:, k : k + 1], batch.record("pixels")[:, k], 0.0)
         np.testing.assert_allclose(shown, expected, rtol=1e-5, atol=1e-3)
-        np.testing.assert_array_equal(seen[f"feature_{k + 1}_valid"][:, 0], valid[:, k])
+        np.testing.assert_array_equal(seen[f"feature_{k}_valid"][:, 0], valid[:, k])
 
 
 def test_noisy_observations_have_the_stated_noise_and_no_memory():

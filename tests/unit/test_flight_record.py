@@ -143,8 +143,8 @@ def test_measurements_and_decisions_of_every_sensor_are_recorded(tmp_path):
     np.testing.assert_array_equal(np.hstack(last), decided)
     assert_same_flights(flight, Flight.load(flight.save(tmp_path / "aided.npz")))
     names = table(flight.rows)
-    np.testing.assert_array_equal(names["uwb_range_2"], flight["uwb_range"][:, 1])
-    np.testing.assert_array_equal(names["uwb_range_decision_3"], flight["uwb_range_decision"][:, 2])
+    np.testing.assert_array_equal(names["uwb_range_1"], flight["uwb_range"][:, 1])
+    np.testing.assert_array_equal(names["uwb_range_decision_2"], flight["uwb_range_decision"][:, 2])
 
 
 def test_file_from_before_a_sensor_has_nan_in_its_columns(tmp_path):
@@ -382,10 +382,10 @@ def test_the_table_names_every_number_once():
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
     assert len(columns) == numbers - 225 + 15  # only standard deviations of the covariance
     np.testing.assert_array_equal(columns["quaternion_w"], flight["quaternion"][:, 0])
-    np.testing.assert_array_equal(columns["rotor_speeds_4"], flight["rotor_speeds"][:, 3])
+    np.testing.assert_array_equal(columns["rotor_speeds_3"], flight["rotor_speeds"][:, 3])
     np.testing.assert_array_equal(columns["gnss_decision_velocity"], flight["gnss_decision"][:, 2])
-    np.testing.assert_array_equal(columns["feature_decision_2"], flight["feature_decision"][:, 1])
-    np.testing.assert_array_equal(columns["pixels_2_y"], flight["pixels"][:, 1, 1])
+    np.testing.assert_array_equal(columns["feature_decision_1"], flight["feature_decision"][:, 1])
+    np.testing.assert_array_equal(columns["pixels_1_y"], flight["pixels"][:, 1, 1])
     sigma = np.sqrt(flight["covariance"][:, 4, 4])
     np.testing.assert_array_equal(columns["sigma_velocity_y"], sigma)
 

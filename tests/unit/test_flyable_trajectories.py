@@ -78,7 +78,7 @@ def test_infeasible_trajectory_error_names_value_time_and_segment():
         (motion.thrust, "thrust of {:.4g} N", {"max_thrust": 8.5}),
         (motion.tilt, "a tilt of .* degrees", {"max_tilt": math.radians(20.0)}),
         (rates[:, 0], "body rate about x of {:.4g} rad/s", {"max_body_rates": (0.1, 6.0, 6.0)}),
-        (forces[:, rotor], f"force of rotor {rotor + 1} of {{:.4g}} N", {"max_thrust": 1e3}),
+        (forces[:, rotor], f"force of rotor {rotor} of {{:.4g}} N", {"max_thrust": 1e3}),
     ):
         k = int(values.argmax())
         segment = np.searchsorted(path.times, times[k], side="right")

@@ -113,8 +113,8 @@ def test_plots_keep_every_bit(read_back):
         ("consistency/nees", flight["nees"]),
         ("position/up/error", error[:, 2]),
         ("position/up/upper", 3.0 * np.sqrt(flight["covariance"][:, 2, 2])),
-        ("rotors/4", flight["rotor_speeds"][:, 3]),
-        ("actions/1", flight["action"][:, 0]),
+        ("rotors/3", flight["rotor_speeds"][:, 3]),
+        ("actions/0", flight["action"][:, 0]),
     ):
         found = numbers(entities[f"/plots/{name}"]["Scalars:scalars"])
         np.testing.assert_array_equal(found, expected, err_msg=name)
