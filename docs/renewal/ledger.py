@@ -15,7 +15,7 @@ from baselines.policies import PRETRAINED
 from docs.renewal import release
 from docs.renewal.catalog import Result
 from scripts.estimate_bench import table as estimate_bench
-from scripts.studies import conclusions
+from scripts.studies import again, conclusions
 
 FILE = Path(__file__).with_name("ledger.json")
 GOLDEN = Path(__file__).parents[2] / "tests/golden/flights.json"
@@ -68,4 +68,4 @@ def texts(entries: dict[str, Any]) -> dict[str, str]:
 
 def measured_per_seed() -> dict[str, str]:
     """Texts of studies and of the benchmark, computed from the rows per seed in docs/data."""
-    return conclusions.texts() | estimate_bench.texts()
+    return conclusions.texts() | estimate_bench.texts() | again.texts()

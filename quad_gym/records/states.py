@@ -34,6 +34,24 @@ def covariance_of(P: NDArray[Any], arc: NDArray[Any]) -> NDArray[np.float64]:
     return whole
 
 
+def variances_of(P: NDArray[Any], arc: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the diagonals (..., 15) of `covariance_of`, without the rest of it."""
+    diagonals = np.einsum("...ii->...i", P)[..., ROWS].astype(np.float64)
+    diagonals[..., :6] += arc**2
+    return diagonals
+
+
+def covariance_block_of(P: NDArray[Any], arc: NDArray[Any], first: int) -> NDArray[np.float64]:
+    """Return the blocks (..., 3, 3) of `covariance_of` from row and column `first` on."""
+    row = ROWS[first]
+    lower = np.tril(P[..., row : row + 3, row : row + 3])
+    block = np.asarray(lower + np.swapaxes(np.tril(lower, -1), -1, -2), np.float64)
+    if first < 6:
+        part = arc[..., first : first + 3]
+        block += part[..., np.newaxis] * part[..., np.newaxis, :]
+    return block
+
+
 def joint_covariance(P: NDArray[Any], P_slow: NDArray[Any]) -> NDArray[np.float64]:
     """Return the covariances (..., 15 + n, 15 + n) of all states from the lower triangles.
 

@@ -21,8 +21,10 @@ from quad_gym.records import (
     SHOWN_SIZE,
     Command,
     Result,
+    covariance_block_of,
     covariance_of,
     in_double,
+    variances_of,
 )
 
 # --------------------------------------------------------------------------------------------------
@@ -239,7 +241,7 @@ def _block(first: int, unit: str, frame: str, of: str) -> tuple[GroupField[Float
 
     @field("(n, 3, 3)", squared, frame, f"covariance of the {of}")
     def covariance(self: "EstimateView") -> Floats:
-        return self.covariance[:, first : first + 3, first : first + 3].copy()
+        return covariance_block_of(self._flights.rows("P"), self._flights.rows("arc"), first)
 
     @field("(n, 3)", unit, frame, f"standard deviations of the {of}")
     def sigma(self: "EstimateView") -> Floats:
@@ -277,7 +279,7 @@ class EstimateView(Group):
 
     @field("(n, 15)", "mixed", "mixed", "standard deviations, square roots of the diagonal of the covariance")
     def sigma(self) -> Floats:
-        return np.sqrt(np.einsum("nii->ni", self.covariance))
+        return np.sqrt(variances_of(self._flights.rows("P"), self._flights.rows("arc")))
 
     position_covariance, position_sigma = _block(0, "m", "I", "position")
     velocity_covariance, velocity_sigma = _block(3, "m/s", "I", "velocity")

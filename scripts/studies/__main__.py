@@ -6,6 +6,7 @@
     python -m scripts.studies look_around --quick          # minutes: a check, not a result
     python -m scripts.studies look_around --arms-file my_arms.py --arms truth mine
     python -m scripts.studies run --all                    # everything behind the pages
+    python -m scripts.studies again                        # its policies in other episodes
 
 Arms of scripts/studies/arms.py (or of a file like it) are trained with the compiled PPO, or
 with another algorithm of Stable-Baselines3 that they name, and every policy
@@ -18,7 +19,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -152,18 +153,12 @@ def main(args: StudyArgs) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["run"]:
-        from scripts.studies import run
+    if sys.argv[1:2] in (["run"], ["again"]):
+        from scripts.studies import again, run
 
-        words = sys.argv[2:]
-        sys.exit(
-            run.main(
-                options.parse(
-                    run.RunArgs,
-                    words,
-                    prog="python -m scripts.studies run",
-                    description=run.__doc__,
-                )
-            )
-        )
+        program: Any = {"run": run, "again": again}[sys.argv[1]]
+        kind = {"run": run.RunArgs, "again": again.AgainArgs}[sys.argv[1]]
+        prog = f"python -m scripts.studies {sys.argv[1]}"
+        words = options.parse(kind, sys.argv[2:], prog=prog, description=program.__doc__)
+        sys.exit(program.main(words))
     main(options.parse(StudyArgs, prog="python -m scripts.studies", description=__doc__))

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import fisher_exact
 
 from quad_gym.analysis.metrics import mean_interval, rate_over_trainings
-from scripts.studies import campaign, conclusions, run
+from scripts.studies import again, campaign, conclusions, run
 from scripts.studies.campaign import Part, is_complete
 from scripts.studies.parts import PARTS
 from scripts.studies.rows import Rows, effect, mean_effect
@@ -305,3 +305,34 @@ def test_rows_of_other_parts_of_a_table_stay_when_chosen_parts_are_complete(smal
     rows = Rows.read(run.DATA / "small.csv").rows
     assert [row for row in rows if row in known] == known
     assert len(rows) == 2 + 2
+
+
+def test_policies_fly_other_episodes_and_are_compared_with_their_rows(small, capsys):
+    words = again.AgainArgs(output=small.output, episodes=5)
+    assert again.main(words) == 0
+    assert "No policy is here" in capsys.readouterr().out
+    assert run.main(dataclasses.replace(small, cells=4)) == 0
+    assert run.main(dataclasses.replace(small, write=True)) == 0
+    trained = next(cell for cell in SMALL.cells(small.output) if cell.seed == 0)
+    flown = again.fly(trained, 5)
+    assert flown == again.fly(trained, 5)
+    assert (flown["arm"], flown["steps"], flown["episodes"]) == (trained.arm.name, 16_384, 5)
+    assert again.fly(trained, 5) != again.fly(trained, 4)
+
+    rows = [again.fly(cell, 5) for cell in again.cells((SMALL,), small.output)]
+    assert len(rows) == 4
+    again.write(rows[:3], run.DATA)
+    again.write(rows[1:], run.DATA)  # in place of the same ones
+    assert sorted(map(str, again.read(run.DATA))) == sorted(
+        str({**dict.fromkeys(again.COLUMNS), **row}) for row in rows
+    )
+    wrong = {**rows[0], "crashed": 1.0 - rows[0]["crashed"]}
+    (found,) = (c for c in again.compared([wrong], run.DATA) if c.column == "crashed")
+    assert not found.within
+    assert abs(found.rate - found.value) > 1.9 * found.sigma
+
+
+def test_committed_rates_in_other_episodes_agree_with_those_of_the_rows():
+    for one in again.compared(again.read()):
+        # 10^-5 to each side; errors of a difference of rates are nearly normal
+        assert abs(one.rate - one.value) < 4.5 * one.sigma, one
