@@ -252,10 +252,14 @@ def stale_race_substitutes(rows: Rows) -> str:
 
 
 def stale_race_curve(rows: Rows) -> str:
-    """Success by budget, as a table."""
-    body = []
+    """Success by budget, as a table, which names the budgets that are not complete."""
+    body, (truth, ours) = [], CURVE_ARMS
+    measured = {int(row["steps"]) for row in rows.of(ours).rows}
     for steps in sorted((*RACE_CURVE, BUDGETS["StaleRace"])):
-        arms, (truth, ours) = Arms(rows, steps), CURVE_ARMS
+        if steps not in measured:
+            body.append([f"{steps:,}", "not yet measured", "not yet measured", ""])
+            continue
+        arms = Arms(rows, steps)
         changed = arms.against(ours, truth, separator=LINE)
         body.append([f"{steps:,}", arms.success(truth), arms.success(ours), changed])
     seeds = Arms(rows, BUDGETS["StaleRace"])[CURVE_ARMS[0]].seeds
