@@ -96,7 +96,8 @@ test-single: setup  ## golden flights and exported filters in single precision, 
 test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
-soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
+soak: setup  ## MINUTES=10 of random cases, 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
+	$(BIN)/python -m tests.soak --minutes $(or $(MINUTES),10)
 	QUAD_GYM_SOAK_STEPS=100000000 QUAD_GYM_SOAK_UPDATES=10000000 $(BIN)/python -m pytest -s -m slow tests/soak
 
 golden: setup  ## after flights have changed on purpose: compute their digests again

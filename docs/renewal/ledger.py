@@ -16,6 +16,7 @@ from docs.renewal import release
 from docs.renewal.catalog import Result
 from scripts.estimate_bench import table as estimate_bench
 from scripts.studies import again, conclusions
+from tests.soak import log as soak
 
 FILE = Path(__file__).with_name("ledger.json")
 GOLDEN = Path(__file__).parents[2] / "tests/golden/flights.json"
@@ -67,5 +68,5 @@ def texts(entries: dict[str, Any]) -> dict[str, str]:
 
 
 def measured_per_seed() -> dict[str, str]:
-    """Texts of studies and of the benchmark, computed from the rows per seed in docs/data."""
-    return conclusions.texts() | estimate_bench.texts() | again.texts()
+    """Texts of studies, of the benchmark and of the soak, computed from the rows in docs/data."""
+    return conclusions.texts() | estimate_bench.texts() | again.texts() | soak.texts()

@@ -31,7 +31,7 @@ from quad_gym.faults import FaultsGiven, GnssOutage, felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, show
 from quad_gym.params.randomization import Given, Randomization
-from quad_gym.params.suites import SensorSuite, sensor_suite
+from quad_gym.params.suites import SensorSuite, given_suite
 from quad_gym.params.task import RewardParams, TaskParams, check_limit, fields_without_effect
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import ActionParams, VehicleParams
@@ -367,7 +367,9 @@ def with_effect(keywords: Mapping[str, Any]) -> dict[str, Any]:
     idle = FILTER_ARGUMENTS if runs_no_sensor(keywords) else ()
     kept = {name: value for name, value in keywords.items() if name not in idle}
     if keywords.get("observation") in ("truth", "noisy") and {"faults", "sensors"} <= set(kept):
-        kept["faults"] = felt_without_sensors(kept["faults"], sensor_suite(kept["sensors"]))
+        kept["faults"] = felt_without_sensors(
+            kept["faults"], given_suite("sensors", kept["sensors"])
+        )
     return kept
 
 

@@ -262,6 +262,9 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         finals |= final_parts(infos, batch, over)
         if flown_with:
             finals["drawn"] = flown_with
+        if "reward_terms" in infos:  # which stay in `infos`, too: their sum is the reward
+            terms = infos["reward_terms"].items()
+            finals["reward_terms"] = {name: np.where(over, values, 0.0) for name, values in terms}
         began = np.flatnonzero(over)
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = batch.record(name, began)

@@ -39,6 +39,28 @@ def assert_same(left, right, where="root"):
         assert left == right, f"{where}: {left!r} is not {right!r}"
 
 
+def masked_infos(infos):
+    """Return infos without the values that the masks next to them exclude."""
+    kept = {}
+    for name, values in infos.items():
+        mask = infos.get(f"_{name}")
+        if isinstance(values, dict):
+            kept[name] = masked_infos(values)
+        elif mask is None:
+            kept[name] = values
+        elif values.dtype == object:
+            kept[name] = [value for value, said in zip(values, mask, strict=True) if said]
+        else:
+            kept[name] = values[mask].astype(float)
+    return kept
+
+
+def assert_same_results(mine, other, where):
+    """Check that results are equal, and infos where their masks are true."""
+    assert_same(mine[:-1], other[:-1], where)
+    assert_same(masked_infos(mine[-1]), masked_infos(other[-1]), where)
+
+
 def state_of(env):
     """Return the state of all flights as bytes, for each of the three interfaces."""
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()

@@ -129,6 +129,9 @@ def test_evaluate_passes_filter_keywords_only_to_flights_with_filter(tmp_path):
     truth, estimate = ({"observation": name} for name in ("truth", "estimate"))
     assert with_effect(given | truth) == truth | {"sensors": "rtk"}
     assert with_effect(given | estimate) == estimate | given
+    for sensors in ("rtk", quad_gym.sensor_suite("rtk")):  # by name, and as an object
+        faulty = {"sensors": sensors, "faults": "gnss_outage+rotor_loss", "observation": "truth"}
+        assert [fault.name for fault in with_effect(faulty)["faults"]] == ["rotor_loss"]
 
 
 def test_task_is_named_by_its_first_argument_or_base():

@@ -76,6 +76,21 @@ def test_own_task_shows_the_terms_that_it_returns():
     assert crashes > 0
 
 
+def test_terms_of_the_last_step_are_in_the_final_info_too():
+    """The terms in `info` stay, as the reward is their sum, if the next episode begins at once."""
+    env = QuadVectorEnv(3, "hover", autoreset_mode="SameStep", max_episode_steps=5, **BASE)
+    env.reset(seed=4)
+    for _ in range(5):
+        _, reward, _, _, info = env.step(np.full((3, 4), 0.1))
+    ended, now = info["final_info"]["reward_terms"], info["reward_terms"]
+    assert info["_final_info"].all()
+    assert {name for name in ended if name[0] != "_"} == TERMS["hover"]
+    for name in TERMS["hover"]:
+        np.testing.assert_array_equal(ended[name], now[name])
+        assert ended[f"_{name}"].all()
+    np.testing.assert_array_equal(sum(ended[name] for name in ended if name[0] != "_"), reward)
+
+
 def test_own_task_has_one_term_or_terms_of_its_base():
     task = quad_gym.Task.of(reward=rewards.Heading())
     paid, terms, _ = flown(task, 5, base="hover")

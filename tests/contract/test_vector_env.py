@@ -9,7 +9,7 @@ import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from tests.builders import SHORT, STEPS, actions_for, actions_of, vec_env
-from tests.contract.comparing import assert_same, state_of
+from tests.contract.comparing import assert_same, assert_same_results, state_of
 from tests.contract.configurations import CONFIGURATIONS
 
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -22,28 +22,6 @@ def both(name, count, mode):
     envs = [lambda: QuadEnv(**keywords)] * count
     ours = QuadVectorEnv(count, autoreset_mode=mode, threads=2, **keywords)
     return ours, SyncVectorEnv(envs, autoreset_mode=AutoresetMode(mode))
-
-
-def masked_infos(infos):
-    """Return infos without the values that the masks next to them exclude."""
-    kept = {}
-    for name, values in infos.items():
-        mask = infos.get(f"_{name}")
-        if isinstance(values, dict):
-            kept[name] = masked_infos(values)
-        elif mask is None:
-            kept[name] = values
-        elif values.dtype == object:
-            kept[name] = [value for value, said in zip(values, mask, strict=True) if said]
-        else:
-            kept[name] = values[mask].astype(float)
-    return kept
-
-
-def assert_same_results(mine, other, where):
-    """Check that results are equal, and infos where their masks are true."""
-    assert_same(mine[:-1], other[:-1], where)
-    assert_same(masked_infos(mine[-1]), masked_infos(other[-1]), where)
 
 
 def fly_both(ours, theirs, steps, seed):

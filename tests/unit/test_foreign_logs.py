@@ -262,6 +262,18 @@ def test_heights_above_the_ellipsoid_that_are_not_filled_are_replaced(flight, tm
     arrives(flight, tmp_path / "flight.ulg")
 
 
+def test_log_whose_topic_lacks_a_field_is_read_without_it(flight, tmp_path):
+    """One wrong byte in the definition of a topic renames its field."""
+    pytest.importorskip("pyulog")
+    file = tmp_path / "flight.ulg"
+    foreign.write_px4(file, flight)
+    file.write_bytes(file.read_bytes().replace(b"uint8_t fix_type;", b"uint8_t fix_tyqe;"))
+    log = read_log(file)
+    assert len(log.imu) == len(flight.time)
+    assert log.gnss is None
+    has(log.notes, "vehicle_gps_position", "no fix")
+
+
 # ---- ROS -----------------------------------------------------------------------------------------
 
 
@@ -601,6 +613,16 @@ def test_errors_of_tables_name_the_file(text, message, tmp_path):
     (tmp_path / "mine.csv").write_text(text)
     with pytest.raises(ValueError, match=f"^mine.csv: {message}"):
         read_log(tmp_path / "mine.csv")
+
+
+def test_damaged_compressed_table_is_refused_by_name(tmp_path):
+    """Wrong bytes in the head, of the first block, and of the checksum: different exceptions."""
+    text = b"time,gyro_x\n" + b"".join(b"%d,%d\n" % (k, k * k) for k in range(3000))
+    whole, file = gzip.compress(text, mtime=0), tmp_path / "log.csv.gz"
+    for place in (0, 10, len(whole) - 8):
+        file.write_bytes(whole[:place] + b"\xff" * 4 + whole[place + 4 :])
+        with pytest.raises(ValueError, match=r"log\.csv\.gz must be a table of text"):
+            read_log(file)
 
 
 def test_map_of_columns_converts_units_axes_clocks_and_makes_measurements(flight, tmp_path):

@@ -61,6 +61,13 @@ _PWM = (1000.0, 1000.0)  #: least pulse and range of `actuator_outputs` [us]
 _Topic = Mapping[str, Any]
 
 
+class _Fields(dict[str, Any]):
+    """Fields of a topic. One that a damaged log lacks holds NaN."""
+
+    def __missing__(self, name: str) -> Floats:
+        return np.full(len(next(iter(self.values()))), np.nan)
+
+
 def read_ulog(path: Path | str) -> RawLog:
     """Read a log of PX4.
 
@@ -79,7 +86,7 @@ def read_ulog(path: Path | str) -> RawLog:
         topics: dict[str, dict[int, _Topic]] = {}
         for data in ulog.data_list:
             if len(data.data["timestamp"]):
-                topics.setdefault(data.name, {})[data.multi_id] = data.data
+                topics.setdefault(data.name, {})[data.multi_id] = _Fields(data.data)
         parameters = dict(ulog.initial_parameters)
     if "sensor_combined" not in topics:
         raise ValueError(f"{file.name} must have the topic sensor_combined, got {sorted(topics)}")

@@ -3,6 +3,7 @@
 import csv
 import gzip
 import tomllib
+import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -99,7 +100,7 @@ def csv_columns(path: Path) -> Columns:
                         f"row {count}"
                     )
                 numbers.extend(_number(path, cell, count) for cell in row)
-    except (UnicodeDecodeError, csv.Error, EOFError, gzip.BadGzipFile):
+    except (UnicodeDecodeError, csv.Error, EOFError, gzip.BadGzipFile, zlib.error):
         raise ValueError(
             f"{path.name} must be a table of text (.csv), a log (.ulg, .bin), a bag or a folder"
         ) from None
