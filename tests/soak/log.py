@@ -83,7 +83,7 @@ def commit() -> str:
 # Summary: the texts of the page.
 # --------------------------------------------------------------------------------------------------
 
-HEADS = ("kind", "cases", "refused by name", "processor time", "failed", "memory per 1,000 cases")
+HEADS = ("kind", "cases", "refused by name", "processor time", "failed", "growth of memory")
 
 
 def texts(rows: Sequence[Row] | None = None) -> dict[str, str]:
@@ -111,12 +111,12 @@ def sentence(rows: Sequence[Row]) -> str:
 def _line(found: tuple[str, list[Row]]) -> list[str]:
     kind, rows = found
     seconds, grown_in = sum(row.seconds for row in rows), sum(row.grown_in for row in rows)
-    growth = 1000.0 * sum(row.growth for row in rows) / grown_in if grown_in else 0.0
+    growth = sum(row.growth for row in rows)
     return [
         kind.replace("_", " "),
         f"{sum(row.cases for row in rows):,}",
         f"{sum(row.refused for row in rows):,}",
         f"{seconds / 60.0:,.1f} min",
         f"{sum(row.differing for row in rows):,}",
-        f"{growth:+.1f} MB" if grown_in else "",
+        f"{growth:+.1f} MB in {grown_in:,} cases" if grown_in else "",
     ]

@@ -190,8 +190,8 @@ def test_summary_of_a_log_adds_its_rows():
     )
     assert texts["soak"].endswith(", and 1 of them failed.")
     lines = [[cell.strip() for cell in line.split("|")] for line in texts["soak.kinds"].split("\n")]
-    assert ["", "snapshots", "20", "5", "60.0 min", "0", "+0.0 MB", ""] in lines
-    assert ["", "planted", "40", "0", "30.0 min", "1", "+25.0 MB", ""] in lines
+    assert ["", "snapshots", "20", "5", "60.0 min", "0", "+0.0 MB in 8 cases", ""] in lines
+    assert ["", "planted", "40", "0", "30.0 min", "1", "+0.4 MB in 16 cases", ""] in lines
 
 
 def test_log_of_a_file_has_the_rows_that_were_appended(tmp_path):
