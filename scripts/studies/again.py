@@ -1,12 +1,12 @@
 """Fly the policies of the studies again, in other episodes, and compare them with their rows.
 
     python -m scripts.studies again                     # all rows whose policies are here
-    python -m scripts.studies again --parts StaleRace   # those of some parts
+    python -m scripts.studies again --parts StaleRace   # only some parts
     python -m scripts.studies again --write             # also write docs/data/again.csv
 
 Each fixed rule, and each policy whose training is in the folder of the studies, flies episodes that
 neither its training nor the row has flown. Prints the rate of success and of crashes for each arm
-beside the row's, and whether it lies within the interval of the page.
+and the row, and whether it lies within the interval of the page.
 """
 
 import csv
@@ -44,7 +44,7 @@ class AgainArgs:
     output: Path = OUTPUT
     """folder of trainings and rows"""
     write: bool = False
-    """write the rows into docs/data/again.csv, in place of those of the same policies"""
+    """write the rows into docs/data/again.csv, and replace earlier ones of these policies"""
 
 
 def cells(parts: Sequence[Part], root: Path) -> Iterator[Cell]:
@@ -83,7 +83,7 @@ def read(folder: Path = DATA) -> list[dict[str, Any]]:
 
 
 def write(rows: Sequence[Mapping[str, Any]], folder: Path = DATA) -> Path:
-    """Write rows, in place of those of the same policies."""
+    """Write rows, which replace earlier ones of these policies."""
     found = {_key(row): row for row in (*read(folder), *rows)}
     with (folder / FILE).open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
@@ -96,7 +96,7 @@ def write(rows: Sequence[Mapping[str, Any]], folder: Path = DATA) -> Path:
 
 @dataclass(frozen=True)
 class Compared:
-    """Rate of an arm in its row's episodes and in the others, of the same trainings."""
+    """Rate of an arm in the rows' episodes and in the others, with the same trainings."""
 
     name: str
     column: str
@@ -104,7 +104,7 @@ class Compared:
     rate: float
     """in the others"""
     value: float
-    """of the same trainings, in the episodes of the rows"""
+    """mean of these trainings' rows"""
     low: float
     """of the page's interval, over all trainings"""
     high: float
@@ -118,7 +118,7 @@ class Compared:
 
 
 def compared(again: Sequence[Mapping[str, Any]], folder: Path = DATA) -> list[Compared]:
-    """Compare rows with those of the tables; rows of other flights are left out."""
+    """Compare rows with the tables; rows of other flights are left out."""
     found: list[Compared] = []
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in again:

@@ -332,7 +332,7 @@ def test_policies_fly_other_episodes_and_are_compared_with_their_rows(small, cap
     assert abs(found.rate - found.value) > 1.9 * found.sigma
 
 
-def test_committed_rates_in_other_episodes_agree_with_those_of_the_rows():
+def test_committed_rates_in_other_episodes_agree_with_the_rows():
     for one in again.compared(again.read()):
         # 10^-5 to each side; errors of a difference of rates are nearly normal
         assert abs(one.rate - one.value) < 4.5 * one.sigma, one
