@@ -73,10 +73,15 @@ def today() -> str:
 
 
 def commit() -> str:
-    """Return the commit of the checkout, with a plus sign if files of it have changed."""
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+", "--exclude=*"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
+    """Return the commit of the checkout, with a plus sign if files other than the log differ."""
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        command = ["git", "-C", str(ROOT), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    changed = git("diff", "--quiet", "HEAD", "--", ".", f":(exclude){FILE.relative_to(ROOT)}")
+    found = git("rev-parse", "--short=8", "HEAD").stdout.strip()
+    return f"{found}{'+' * (changed.returncode != 0)}" if found else "unknown"
 
 
 # --------------------------------------------------------------------------------------------------

@@ -10,8 +10,9 @@ import pytest
 
 import quad_gym
 from quad_gym.faults import PRESETS
-from quad_gym.records import FilterStatus, GateDecision, Source
+from quad_gym.records import Source
 from tests.field_flights import fly
+from tests.soak.validity import assert_failures_are_reported, assert_positive_definite
 
 UPDATES = int(float(os.environ.get("QUAD_GYM_SOAK_UPDATES", "1e6")))
 SHARES = {"lab": 0.55, "rtk": 0.25, "consumer": 0.1, "indoor": 0.1}
@@ -36,40 +37,6 @@ def tally():
     counts = {"updates": 0, "failed updates": 0, "failed predictions": 0, "wholly left out": 0}
     yield counts
     print("\n" + ", ".join(f"{number:,} {name}" for name, number in counts.items()))
-
-
-def assert_positive_definite(L):
-    """Check that factors L (n, 15, 15) are lower triangular, and that LAPACK can factor L L^T. A
-    column of L may have either sign: the large turn of a reset can change it, but not L L^T."""
-    assert np.isfinite(L).all()
-    assert not np.triu(L, 1).any()
-    assert (np.diagonal(L, axis1=1, axis2=2) != 0.0).all()
-    P = L @ L.transpose(0, 2, 1)
-    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
-    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    correlation = P / sigma[:, :, np.newaxis] / sigma[:, np.newaxis]
-    assert abs(correlation).max() <= 1.0 + 1e-12
-    np.linalg.cholesky(correlation)
-
-
-def assert_failures_are_reported(batch, failures, nis):
-    """Check that the status reports all failures, and that each accepted update had an effect.
-
-    Returns:
-        Flags of flights with an update, the number of wholly rejected updates, failures and NIS.
-    """
-    counted = np.array([batch.record("update_failures"), batch.record("prediction_failures")])
-    status, now = batch.record("filter_status").astype(np.int64), batch.record("nis")
-    np.testing.assert_array_equal(counted[0] > 0.0, status & FilterStatus.UPDATE_FAILED > 0)
-    np.testing.assert_array_equal(counted[1] > 0.0, status & FilterStatus.PREDICTION_FAILED > 0)
-    assert ((counted - failures) <= 2.0).all()
-    measured, gate = batch.record("block_valid") > 0.0, batch.record("gate")
-    made, accepted = measured.any(axis=1), (measured & (gate == GateDecision.ACCEPTED)).any(axis=1)
-    failed = counted[0] > failures[0]
-    known = np.isfinite(now) & np.isfinite(nis)  # no NIS for an image processed in steps
-    np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
-    np.testing.assert_array_equal((measured & (gate == GateDecision.FAILED)).any(axis=1), failed)
-    return made, int((made & ~accepted & ~failed).sum()), counted, now
 
 
 @pytest.mark.slow

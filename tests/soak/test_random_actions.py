@@ -10,30 +10,12 @@ import pytest
 import quad_gym
 from quad_gym.envs.config import BENCHMARKS
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.records import FLIGHT_FIELDS
 from tests.contract.comparing import ACTIONS, OBSERVATIONS
+from tests.soak.validity import assert_records_are_finite
 
 STEPS = int(float(os.environ.get("QUAD_GYM_SOAK_STEPS", "1e6")))
 COUNT = 1000
 COMBINATIONS = [(task, action) for task in quad_gym.IDS.values() for action in ACTIONS]
-NOT_MEASURED = (
-    "start_given",
-    "innovation",
-    "innovation_sigma",
-    "block_nis",
-    "obstacle_distance",
-    "nis",  # after an update in steps
-    "stamps",  # without a waiting measurement
-    "drawn",  # for a sensor that the suite lacks
-)
-"""Fields that hold NaN where nothing was given or measured."""
-ALWAYS_FINITE = [field.name for field in FLIGHT_FIELDS if field.name not in NOT_MEASURED]
-
-
-def assert_records_are_finite(env):
-    for name in ALWAYS_FINITE:
-        bad = ~np.isfinite(env.flights.batch.record(name).astype(float))
-        assert not bad.any(), f"{name} of flights {np.unique(np.nonzero(bad)[0])[:9]}"
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +66,6 @@ def test_records_stay_finite_under_random_actions(task, action, total):
         failures += int((info["filter_status"] > 0).sum())
         assert all(np.isfinite(values).all() for values in (*observation.values(), reward))
         if k % 20 == 0 or k == steps - 1:
-            assert_records_are_finite(env)
+            assert_records_are_finite(env.flights.batch)
     total.append(flown)
     print(f"{task}, {action}: {flown:,} steps, {failures:,} of them with a failed filter")

@@ -26,8 +26,9 @@ from quad_gym.frames import geodetic_to_ecef
 from quad_gym.logs.formats import read_log
 from quad_gym.logs.replaying.log_start import wide_start
 from quad_gym.params.suites import ALL_SUITES
-from quad_gym.records import REAL, SINGLE
+from quad_gym.records import SINGLE
 from tests.console_commands import refused
+from tests.exported import as_printed, estimates, hard_log, parsed
 from tests.logged_flights import Recorded, flown
 
 FOLDER = Path(tempfile.mkdtemp(prefix="quad_gym_filters_"))
@@ -111,22 +112,6 @@ def example(name, target, *flags, compiler="cc"):
     return program
 
 
-def estimates(*command):
-    return parsed(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-
-
-def parsed(printed):
-    names, *rows = printed.split()
-    return names.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
-
-
-def as_printed(result):
-    """Columns of a replay (n, columns), rounded to the precision of the process, but not times."""
-    columns = np.array(list(result.columns().values()))
-    columns[1:] = columns[1:].astype(REAL)
-    return columns.T
-
-
 def require_equal(run, log, suite, start):
     """Replay a log, and compare with the output of a program on its samples."""
     samples = FOLDER / f"samples_{len(list(FOLDER.iterdir()))}.csv"
@@ -144,31 +129,6 @@ def test_example_prints_estimates_of_replay(name):
     suite, program = quad_gym.sensor_suite(name), example(name, "x86-64")
     start = REST if suite.gnss is None else {}
     require_equal(partial(estimates, program), logged(name), suite, start)
-
-
-def hard_log(suite):
-    """Return a table that begins in motion, and its start.
-
-    The gyro jumps, so that states are reset; each 25th measurement is an outlier; all sensors but
-    the IMU pause for 0.7 s.
-    """
-    flight = flown(suite, 8.0)
-    table = Recorded(flight, suite).table()
-    late = table["received"] > 1.5
-    table = {k: v[late].copy() for k, v in table.items() if np.isfinite(v).any()}
-    time, own = table["time"], ("time", "received", "gyro", "accel", "motor")
-    table["gyro_x"][time > 4.0] += 0.15
-    for name in (name for name in table if not name.startswith(own)):
-        table[name][(time > 5.5) & (time < 6.2)] = np.nan
-        rows = np.flatnonzero(np.isfinite(table[name]))[10::25]
-        if len(rows):
-            table[name][rows] += 30.0 * np.nanstd(table[name])
-    row = round(1.5 * suite.imu.rate)
-    w, x, y, z = flight["quaternion"][row]
-    start = {"heading": math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))}
-    if suite.gnss is None:
-        start["position"] = tuple(flight["position"][row])
-    return table, start
 
 
 @needs_compiler

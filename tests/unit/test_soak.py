@@ -9,8 +9,9 @@ import pytest
 from quad_gym import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from tests.exported import as_printed
 from tests.soak import __main__ as program
-from tests.soak import configurations, damaged_logs, log, snapshots
+from tests.soak import configurations, damaged_logs, exports, faults, log, snapshots
 from tests.soak.cases import Case, Kind, generator, run_case
 from tests.soak.kinds import KINDS
 from tests.soak.running import row_of
@@ -18,8 +19,10 @@ from tests.soak.running import row_of
 MODULES = {
     "configurations": configurations,
     "snapshots": snapshots,
+    "faults": faults,
     "damaged_logs": damaged_logs,
 }
+"""Kinds of which a case takes little time."""
 
 
 def flown(name):
@@ -117,6 +120,51 @@ def test_wrong_end_of_a_replay_is_found(plant, monkeypatch):
         "second": "the second time.gyro_bias_sigma_z",
     }
     assert words[plant] in failure("damaged_logs", number)
+
+
+@pytest.mark.parametrize("plant", ["nan", "factor", "flag"])
+def test_invalid_record_of_a_flight_with_faults_is_found(plant, monkeypatch):
+    record = FlightBatch.record
+    plants = {
+        "nan": ("accel", lambda values: values * np.nan),
+        "factor": ("L", lambda values: np.where(np.eye(15, k=1) > 0.0, 1e-9, values)),
+        "flag": ("filter_status", lambda values: values | 2),
+    }
+    field, changed = plants[plant]
+
+    def other(self, name, *flights):
+        values = record(self, name, *flights)
+        return changed(values) if name == field else values
+
+    monkeypatch.setattr(FlightBatch, "record", other)
+    assert failure("faults", 0).startswith("AssertionError at ")
+
+
+@pytest.mark.parametrize("bits", [0, 1])
+def test_a_bit_of_an_exported_filter_is_found(bits, monkeypatch):
+    """Without compiling one: its output is the replay's."""
+    kept, replay = [], exports.replay
+
+    def kept_replay(*words, **options):
+        kept.append(replay(*words, **options))
+        return kept[-1]
+
+    def printed(*command):
+        rows = as_printed(kept[-1])
+        rows[-1, 3] = np.nextafter(rows[-1, 3], np.inf) if bits else rows[-1, 3]
+        return list(kept[-1].columns()), rows
+
+    monkeypatch.setattr(exports, "replay", kept_replay)
+    monkeypatch.setattr(exports, "estimates", printed)
+    monkeypatch.setattr(exports, "export_filter", lambda *words: None)
+    monkeypatch.setattr(exports.subprocess, "run", lambda *words, **options: None)
+    assert ("Arrays are not equal" in failure("exports", 0)) == bool(bits)
+    assert len(kept) == (1 if bits else 2)
+
+
+def test_missing_programs_of_exports_are_named(monkeypatch):
+    monkeypatch.setattr(exports.shutil, "which", lambda tool: None)
+    assert exports.missing() == ["gcc-aarch64-linux-gnu", "qemu-user-static"]
 
 
 CASES = []
