@@ -22,10 +22,21 @@ NUMBER = re.compile(r"\\tag\{(\d+)\}\s*$")
 """The number of an equation, at its end; repositories' web pages show it, too."""
 
 
+_SIGN = re.compile(
+    r"(^|[=<>(\[{,;&]|\\\\|\\(?:le|ge|approx|times|cdot)\b)(\s*)([-+]|\\[pm][mp]\b)"
+)
+"""A sign without an operand before it, which Ziamath would space as if there were one."""
+
+
+def with_signs(tex: str) -> str:
+    """LaTeX in which a sign of one operand is close to it: as {-}x."""
+    return _SIGN.sub(r"\1\2{\3}", tex)
+
+
 def _picture(node: nodes.Element, *, inline: bool) -> str:
     tex = NUMBER.sub("", " ".join(node.astext().split()))
     try:
-        drawn = ziamath.Latex(tex, size=SIZE, inline=inline, color="currentColor")
+        drawn = ziamath.Latex(with_signs(tex), size=SIZE, inline=inline, color="currentColor")
         svg = drawn.svgxml()
     except Exception as error:  # the warning names page and line
         LOGGER.warning("equation: %r", error, location=node)
