@@ -15,6 +15,7 @@ from scripts.studies.rows import Effect, Rows, effect
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
 HEADS = ("row", "seeds", "success", "crashed", "return", "score", "CPU s")
+MISSING = "-"  #: cell of a number that is not measured with the present flights
 
 ON_ESTIMATE = "training on the estimate, not the truth"
 COMPARED: Mapping[str, tuple[str, str]] = {
@@ -74,14 +75,21 @@ def lines(task: BenchTask, measured: Rows, entered: Rows) -> tuple[list[list[str
         if rule.rows and ideal.rows
         else None
     )
+    # a row that flies the policies of another one shares their training
     every = [
-        (_label(arm.label, memory=arm.name in MEMORY), own.of(arm.name)) for arm in arms_of(task)
+        (
+            _label(arm.label, memory=arm.name in MEMORY),
+            own.of(arm.name),
+            own.of(arm.flies or arm.name),
+        )
+        for arm in arms_of(task)
     ]
     for row in {row["arm"]: row for row in entered.rows}.values():
         label = _label(str(row["label"]), memory=row["track"] == "memory")
-        every.append((label, fresh.of(row["arm"])))
-    found = [_line(label, rows, ends) for label, rows in every if rows.rows]
-    return found, [label for label, rows in every if not rows.rows]
+        entry = fresh.of(row["arm"])
+        every.append((label, entry, entry))
+    found = [_line(label, rows, trained, ends) for label, rows, trained in every if rows.rows]
+    return found, [label for label, rows, _ in every if not rows.rows]
 
 
 def _label(label: str, *, memory: bool) -> str:
@@ -89,9 +97,10 @@ def _label(label: str, *, memory: bool) -> str:
     return f"{label} (memory)" if memory else label
 
 
-def _line(label: str, rows: Rows, ends: tuple[float, float] | None) -> list[str]:
+def _line(label: str, rows: Rows, trained: Rows, ends: tuple[float, float] | None) -> list[str]:
+    """Cells of a row, which has the processor time of the rows that `trained` its policies."""
     returned = rows.estimated("return")
-    scored = "" if ends is None or ends[1] <= ends[0] else number(score(returned, *ends), 2)
+    scored = MISSING if ends is None or ends[1] <= ends[0] else number(score(returned, *ends), 2)
     return [
         label,
         str(rows.seeds) if rows.trained else "rule",
@@ -99,8 +108,13 @@ def _line(label: str, rows: Rows, ends: tuple[float, float] | None) -> list[str]
         share(rows.estimated("crashed")),
         number(returned, 1),
         scored,
-        f"{rows.estimated('seconds').value:.0f}" if rows.trained else "",
+        _seconds(trained) if rows.trained else "",
     ]
+
+
+def _seconds(trained: Rows) -> str:
+    """Mean processor time of trainings [s]."""
+    return f"{trained.estimated('seconds').value:.0f}" if trained.rows else MISSING
 
 
 def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
@@ -109,7 +123,7 @@ def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
     body, missing = lines(task, measured, entered)
     parts = [f"### {task.name}", question]
     if body:
-        body += [[label, "none", *[""] * (len(HEADS) - 2)] for label in missing]
+        body += [[label, "none", *[MISSING] * (len(HEADS) - 2)] for label in missing]
         parts.append(markdown_table(HEADS, body))
     else:
         parts.append("No row is measured with the present flights yet.")
@@ -126,12 +140,12 @@ def effect_of(change: str, task: BenchTask, measured: Rows) -> Effect | None:
 def effects(measured: Rows) -> str:
     """Differences of returns between pairs of rows, by task, as Markdown.
 
-    A task without all seeds of both rows has an empty cell.
+    A task without all seeds of both rows has a dash.
     """
     body = []
     for change in COMPARED:
         found = [effect_of(change, task, measured) for task in TASKS]
-        body.append([change, *("" if e is None else _cell(e) for e in found)])
+        body.append([change, *(MISSING if e is None else _cell(e) for e in found)])
     return f"\n{markdown_table(('change', *(task.name for task in TASKS)), body)}\n"
 
 

@@ -159,12 +159,12 @@ def test_effects_of_training_are_differences_of_complete_rows():
     cells = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
     of_circle = [task.name for task in TASKS].index("Circle")
     trained = cells["training on the estimate, not the truth"]
-    assert [cell.strip() for k, cell in enumerate(trained) if k != of_circle] == [""] * 4
+    assert [cell.strip() for k, cell in enumerate(trained) if k != of_circle] == ["-"] * 4
     assert re.fullmatch(r" \*\*2 \[[12], [23]\]\*\*<br>p < 0.001 ", trained[of_circle])
     assert "returns significantly more in Circle (10 seeds of each)" in table.summary(Rows(rows))
     # the row with a standard deviation lacks a seed
     incomplete = cells["observing standard deviations, trained on the estimate"]
-    assert incomplete[of_circle].strip() == ""
+    assert incomplete[of_circle].strip() == "-"
 
 
 def test_table_shows_rows_of_the_present_flights_only():
@@ -178,6 +178,15 @@ def test_table_shows_rows_of_the_present_flights_only():
     assert lines.keys().isdisjoint(missing)
     assert lines["PPO, estimate"][1] == "3"
     assert lines["PPO, estimate"][5].startswith("0.50 [")
+    assert (lines["best rule"][-1], lines["PPO, estimate"][-1]) == ("", "9")
+    # its policies are those of a row without flights, which has the time of their training
+    assert lines["PPO, truth, tested on the truth"][-1] == "-"
+    rows += [{**measured("truth", seed, 12.0), "seconds": 7.0} for seed in range(3)]
+    found, _ = table.lines(task, Rows(rows), Rows(()))
+    assert {line[0]: line[-1] for line in found}["PPO, truth, tested on the truth"] == "7"
+    assert "| recurrent PPO, estimate (memory) | none | - | - | - | - | - |" in table.block(
+        task, Rows(rows), Rows(())
+    )
     assert {"PPO, truth + independent noise", "SAC, estimate + standard deviations"} < set(missing)
     assert table.score(Estimated(15.0, 12.0, 18.0), 10.0, 20.0) == (0.5, 0.2, 0.8)
     with pytest.raises(ValueError, match="must exceed the rule's"):
