@@ -6,7 +6,7 @@
 All ratios are measured within one run; see `quad-gym benchmark` for the rest. Learning trains the
 compiled PPO with ten seeds, and reports when each was first better than tuned PD control; filters
 compares the built-in filters and `--estimators` on the same flights; peers measures other
-simulators as far as they are installed.
+simulators as far as they are installed; precision compares single with double precision, by turns.
 """
 
 from dataclasses import dataclass
@@ -28,6 +28,7 @@ from scripts.benchmarks import (
     filters,
     learning,
     own_task,
+    precision,
     stages,
 )
 from scripts.benchmarks.linear_sensors import SuiteModel
@@ -41,9 +42,12 @@ SECTIONS = {
     "tasks": own_task.SECTION,
     "compile": compiling.SECTION,
     "learning": learning.SECTION,
+    "precision": precision.SECTION,
 }
 
-SectionName = Literal["filter", "filters", "tick", "peers", "tasks", "compile", "learning"]
+SectionName = Literal[
+    "filter", "filters", "tick", "peers", "tasks", "compile", "learning", "precision"
+]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Sections of the benchmark of parts; no test depends on measured times."""
 
 import json
+import subprocess
 
 import pytest
 
@@ -11,7 +12,7 @@ from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
 from scripts.benchmarks import __main__ as script
-from scripts.benchmarks import learning, stages
+from scripts.benchmarks import learning, precision, stages
 
 
 def run(folder, *options):
@@ -80,6 +81,25 @@ def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_p
     for row in (plain, *others):
         assert row["position"] == pytest.approx(ours["position"], rel=0.01)
         assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
+
+
+def test_precision_section_compares_processes_in_both_precisions(tmp_path, monkeypatch, capsys):
+    started = []
+
+    def process(words, *, env, **_):
+        started.append((env["QUAD_GYM_PRECISION"], words[3]))
+        seconds = {"double": "4e-6\n", "single": "2e-6\n"}[env["QUAD_GYM_PRECISION"]]
+        return subprocess.CompletedProcess(words, 0, stdout=seconds)
+
+    monkeypatch.setattr(subprocess, "run", process)
+    rows = run(tmp_path, "precision", "--sensors", "lab")["sections"]["precision"]
+    turn = [(name, suite) for suite in ("lab", "truth") for name in ("double", "single")]
+    assert started == turn  # one turn of a quick run
+    assert [row["ratio"] for row in rows] == [0.5, 0.5]
+    monkeypatch.undo()
+    capsys.readouterr()
+    precision.main("truth", "16", "1", "0.01")  # what a process prints
+    assert 0.0 < float(capsys.readouterr().out) < 1.0
 
 
 @pytest.mark.slow
