@@ -40,7 +40,10 @@ def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArr
 
 
 def time_filter(scope: Scope) -> list[benchmark.Row]:
-    """Time cycles of update and prediction on one core."""
+    """Time cycles of update and prediction on one core.
+
+    A run of a filter for one vehicle makes the filter, too, which counts among its few cycles.
+    """
     rows: list[benchmark.Row] = []
     count, effort, recorded_ticks = scope.batch, scope.effort, 5 if scope.quick else 40
     with_camera = quad_gym.sensor_suite("lab")
