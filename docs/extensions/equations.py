@@ -12,19 +12,20 @@ import ziamath
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util import logging
+from ziamath.tex import tex2mml
 
 LOGGER = logging.getLogger(__name__)
 SIZE, SCALE = 18.0, 1.08
 """Size at which equations are drawn [pixels], and their scale relative to the text."""
 
+ROW_SPACE, COLUMN_SPACE = "0.5em", "1em"
+"""Space between rows of tables, and between columns of matrices."""
 
 NUMBER = re.compile(r"\\tag\{(\d+)\}\s*$")
 """The number of an equation, at its end; repositories' web pages show it, too."""
 
 
-_SIGN = re.compile(
-    r"(^|[=<>(\[{,;&]|\\\\|\\(?:le|ge|approx|times|cdot)\b)(\s*)([-+]|\\[pm][mp]\b)"
-)
+_SIGN = re.compile(r"(^|[=<>(\[{,;&]|\\\\|\\(?:le|ge|approx|times|cdot)\b)(\s*)([-+]|\\[pm][mp]\b)")
 """A sign without an operand before it, which Ziamath would space as if there were one."""
 
 
@@ -33,10 +34,21 @@ def with_signs(tex: str) -> str:
     return _SIGN.sub(r"\1\2{\3}", tex)
 
 
+def mathml(tex: str, *, inline: bool) -> ElementTree.Element:
+    """MathML of an equation, in the color of the text, with space between cells of matrices."""
+    found = ElementTree.fromstring(tex2mml(with_signs(tex), inline=inline))
+    found.set("mathcolor", "currentColor")
+    for table in found.findall(".//{*}mtable"):
+        table.set("rowspacing", ROW_SPACE)
+        if table.get("columnspacing") is None:  # aligned equations have theirs
+            table.set("columnspacing", COLUMN_SPACE)
+    return found
+
+
 def _picture(node: nodes.Element, *, inline: bool) -> str:
     tex = NUMBER.sub("", " ".join(node.astext().split()))
     try:
-        drawn = ziamath.Latex(with_signs(tex), size=SIZE, inline=inline, color="currentColor")
+        drawn = ziamath.Math(mathml(tex, inline=inline), size=SIZE)
         svg = drawn.svgxml()
     except Exception as error:  # the warning names page and line
         LOGGER.warning("equation: %r", error, location=node)
