@@ -373,7 +373,7 @@ def intervals_figure(
     """Figure of values with intervals: a line for each row, and a color for each column.
 
     Args:
-        values: Value and interval, or None, by row and column.
+        values: Value and its 95 % interval, or None, by row and column.
         unit: Label of the values.
         title: Title.
     """
@@ -386,6 +386,8 @@ def intervals_figure(
             if interval is not None:
                 axes.plot(interval, [row + height] * 2, color=color, linewidth=2.0, alpha=0.6)
             axes.plot(value, row + height, "o", color=color, label=label)
+    if any(interval is not None for row in values.values() for _, interval in row.values()):
+        axes.plot([], [], color="0.5", linewidth=2.0, label="95 % interval")
     axes.set_yticks(range(len(values)), values)
     axes.set_ylim(len(values) - 0.5, -0.5)
     axes.set_xlabel(unit)
