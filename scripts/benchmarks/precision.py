@@ -59,14 +59,14 @@ def time_precision(scope: Scope) -> list[Row]:
 SECTION = benchmark.Section(
     time_precision,
     {
-        "One flight's tick at 50 Hz, one thread, median of the turns": {
+        "One flight's tick at 50 Hz, medians": {
             "suite": benchmark.column("suite"),
             "flights": benchmark.column("flights", ","),
             "us, double": benchmark.column("double", ".3f", 1e6),
             "us, single": benchmark.column("single", ".3f", 1e6),
         },
         "single / double": {
-            "medians": benchmark.column("ratio", ".2f"),
+            "of medians": benchmark.column("ratio", ".2f"),
             "smallest": benchmark.column("smallest", ".2f"),
             "largest": benchmark.column("largest", ".2f"),
         },
