@@ -90,10 +90,13 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     """number of flights"""
     _: KW_ONLY
     vehicle: Annotated[VehicleParams, _vehicle] = cast(Any, "lab")
+    """vehicle that filter and control assume"""
     sensors: Annotated[SensorSuite, given_suite] = cast(Any, "standard")
+    """sensors that the filter assumes, and the filter"""
     gains: PDGains | str | None = None
     """gains of `Control.PD`, or the name of a preset; None: "lab\""""
     action_params: ActionParams | None = None
+    """scales of actions; None: the defaults"""
     task: Annotated[TaskParams, _task] = cast(Any, None)
     """reference, start and termination"""
     source: Annotated[Source, _member(Source)] = Source.ESTIMATE
@@ -103,11 +106,15 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     control_rate: float | None = None
     """actions per second, which must divide the IMU rate; None: the IMU rate [Hz]"""
     substeps: int = 1
+    """Runge-Kutta steps per tick"""
     action_delay: Annotated[float, check.between(0.0, float(MAX_ACTION_DELAY))] = 0.0
+    """delay of actions [control steps]"""
     layout: Annotated[Layout, _member(Layout)] = Layout.RELATIVE
     """layout of the observations"""
     include_std: bool = False
+    """True: observations contain the filter's 15 standard deviations"""
     privileged: bool = False
+    """True: observations end with the truth, for a critic"""
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     """(low, high) of the observations, each (n,); None: no observations"""
     autoreset: Annotated[Autoreset, _member(Autoreset)] = Autoreset.DISABLED
@@ -117,17 +124,23 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     estimator: object = None
     """an own `quad_gym.Estimator`, its class, or "module:Class"; None: the filter of the sensors"""
     filter_start: Literal["cold", "warm"] = "cold"
+    """start of the filter: "cold", from its first measurements, or "warm", when it has converged"""
     innovations: bool = False
     """True: keep innovations and NIS block by block, for `record`: "innovation",
     "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
     `truncate_when_diverged` in their task always keep them"""
     threads: int | None = None
+    """number of threads; None: one for each core"""
     true_vehicle: VehicleParams | None = None
+    """vehicle that flies; None: `vehicle`"""
     true_sensors: SensorSuite | None = None
+    """sensors that measure; None: `sensors`"""
     world: Annotated[WorldParams, _unresolved] = cast(Any, "calm")
     """a preset is that of the flown vehicle"""
     randomization: Annotated[Randomization, _randomization] = cast(Any, None)
+    """parameters that each episode draws; None: none"""
     faults: FaultsGiven = None
+    """faults, or their names; None: none"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -33,13 +33,13 @@ _AGREEMENT = 1e-4
 class ActionField(NamedTuple):
     """Component a of an action: `quantity = offset + scale a`, limited to `most`."""
 
-    name: str
-    offset: float
-    scale: float
-    unit: str
+    name: str  #: name of the quantity, such as "thrust"
+    offset: float  #: quantity for a = 0 [unit]
+    scale: float  #: change of the quantity per unit of a [unit]
+    unit: str  #: unit of the quantity
     frame: str
     """Frame. B: body; H: level, x along the body's heading, y to its left, z up; "-": none"""
-    most: float | None = None
+    most: float | None = None  #: limit on the magnitude of the quantity [unit]; None: no limit
 
     def formula(self, number: int) -> str:
         """Formula for the quantity, such as `thrust = 7.644 (1 + a[0]) N`."""
@@ -68,7 +68,7 @@ def action_fields(action: str, params: Any) -> tuple[ActionField, ...]:
     if action == "motor":
         hover, most = float(params["hover_voltage"]), float(params["max_voltage"])
         return tuple(
-            ActionField(f"voltage of rotor {i}", hover, hover, "V", "-", most) for i in range(1, 5)
+            ActionField(f"voltage of rotor {i}", hover, hover, "V", "-", most) for i in range(4)
         )
     if action == "wrench":
         axes = zip("xyz", map(float, params["torque_scale"]), strict=True)

@@ -29,6 +29,9 @@ kept: dict[str, list[str]] = {}
 ALIAS = re.compile("Alias for field number")
 """Default docstring of the fields of a named tuple."""
 
+BUILT_IN = (tuple, dict, int, float, str, BaseException)
+"""Types of Python whose methods the pages leave out."""
+
 ARRAYS = {
     stringify_annotation(long, "smart"): short
     for long, short in (
@@ -98,9 +101,16 @@ def shorten(
     return parts[0], parts[1]
 
 
+def skip(app: Sphinx, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
+    """Leave out what classes inherit from Python's tuples, dictionaries and numbers."""
+    owner = getattr(obj, "__objclass__", None) or type(getattr(obj, "__self__", None))
+    return True if getattr(owner, "__module__", "") == "builtins" and owner in BUILT_IN else None
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Rewrite docstrings before Napoleon does, and after."""
     app.connect("autodoc-process-docstring", rewrite, priority=100)
     app.connect("autodoc-process-docstring", restore, priority=900)
     app.connect("autodoc-process-signature", shorten)
+    app.connect("autodoc-skip-member", skip)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

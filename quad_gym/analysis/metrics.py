@@ -35,8 +35,8 @@ Floats = NDArray[np.float64]
 class Interval(NamedTuple):
     """Range with an associated confidence or probability."""
 
-    low: float
-    high: float
+    low: float  #: lower end
+    high: float  #: upper end
 
     def holds(self, value: float) -> bool:
         """Return True if a value is in the range, its ends included."""
@@ -232,9 +232,9 @@ TAIL = 0.025  #: probability beyond either end of an interval
 class Estimated(NamedTuple):
     """A number with its 95 % interval."""
 
-    value: float
-    low: float
-    high: float
+    value: float  #: the number
+    low: float  #: lower end of the interval
+    high: float  #: upper end of the interval
 
     def holds(self, value: float) -> bool:
         """Return True if a value lies in the interval, its ends included."""

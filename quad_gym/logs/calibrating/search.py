@@ -331,13 +331,13 @@ largest factor, which is smaller where the filter estimates a correlated error o
 class Calibrated(NamedTuple):
     """A number that a calibration has found."""
 
-    number: Number
-    prior: float
+    number: Number  #: part and field of the suite, with unit and prior
+    prior: float  #: number in the suite from which the calibration starts
     value: float
     """number in the suite; a standard deviation is up to twice the best fit where the log hardly
     determines it"""
     low: float  #: lower end of its 95 % interval
-    high: float
+    high: float  #: upper end of its 95 % interval
     determined: bool  #: False: the log does not determine it
 
 

@@ -45,9 +45,9 @@ _PASSES = 3  #: searches, after each of which the errors' correlation is found a
 class FittedNumber(NamedTuple):
     """A number with its 95 % interval."""
 
-    value: float
-    low: float
-    high: float
+    value: float  #: the number
+    low: float  #: lower end of the interval
+    high: float  #: upper end of the interval
 
 
 class FittedVehicle(NamedTuple):
