@@ -55,6 +55,15 @@ def figure():
     return plots.flight_figure(plots.draw_height, circle())
 
 
+@pytest.mark.parametrize(
+    ("interval", "names"), [((1.0, 3.0), ["a", "95 % interval"]), (None, ["a"])]
+)
+def test_figure_of_intervals_names_its_bars_if_there_are_any(interval, names):
+    figure = plots.intervals_figure({"one": {"a": (2.0, interval)}, "two": {"a": (4.0, None)}}, "m")
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == names
+
+
 def test_saves_png_and_svg_with_the_same_bytes_each_time(tmp_path):
     import matplotlib
 
