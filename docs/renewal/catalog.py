@@ -157,6 +157,12 @@ CATALOG = {
             figures={"0/causes.csv": "docs/data/recovery_causes.csv"},
         ),
         Result(
+            name="compass",
+            commands=["scripts.consistency.compass"],
+            flights=("fault magnetometer_*", "RandomTrajectory, consumer", "Circle, consumer"),
+            texts=texts.compass,
+        ),
+        Result(
             name="ablation_filters",
             commands=["scripts.consistency filters --output OUT"],
             flights=("RandomTrajectory, rtk",),

@@ -294,6 +294,11 @@ def causes(folder: Path, _: Sequence[str]) -> dict[str, str]:
     return shares | {"causes": table(heads, rows)}
 
 
+def compass(_: Path, printed: Sequence[str]) -> dict[str, str]:
+    """Flights with a wrong compass."""
+    return {"compass": f"\n\n{printed[0].strip()}\n\n"}
+
+
 def _limits(shares: Sequence[float]) -> str:
     """The smallest and the largest of some shares [%]."""
     low, high = min(shares), max(shares)

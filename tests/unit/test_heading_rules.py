@@ -301,17 +301,59 @@ def test_large_first_tilt_may_lean_by_four_standard_deviations(confirmed):
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("lean", "changes"),
     [
-        {"level_fresh": 0.0},
-        {"heading_lost": 1.0},
-        {"level_phase": 1.0},
+        (0.13, {"level_fresh": 0.0}),
+        (0.3, {"heading_lost": 1.0}),
+        (0.3, {"level_phase": 1.0}),
     ],
 )
-def test_vertical_is_not_compared_without_a_fix_or_a_known_heading(changes):
-    rules = leaning([0.3] * EIGHT, False, 0.001, **changes)
+def test_vertical_is_not_compared_without_a_fix_or_a_known_heading(lean, changes):
+    rules = leaning([lean] * EIGHT, False, 0.001, **changes)
     np.testing.assert_array_equal(rules.get("compass_out"), 0.0)
     np.testing.assert_array_equal(rules.get("level_lean"), float("level_fresh" in changes))
+
+
+def test_vertical_that_is_far_off_is_wrong_at_once_also_between_two_fixes():
+    lean = [2.0 * math.asin(0.5 * 0.14 * share) for share in np.repeat([0.99, 1.01], 4)]
+    rules = leaning(lean, True, 0.001, level_fresh=0.0, level_against=2.0, level_doubts=9.0)
+    np.testing.assert_array_equal(rules.get("compass_out"), np.repeat([0.0, 1.0], 4))
+    # what only a fix can show has not been counted
+    np.testing.assert_array_equal(rules.get("level_against"), 2.0)
+    np.testing.assert_array_equal(rules.get("level_doubts"), 9.0)
+
+
+@pytest.mark.parametrize("changes", [{}, {"compass_out": 1.0}, {"sigma": 0.27}])
+@pytest.mark.parametrize("left", [0.1, 0.9])
+def test_hard_iron_beyond_five_standard_deviations_contradicts_the_compass(left, changes):
+    """The limit has 1.1 times the suite's variance, minus the filter's.
+
+    Where the motion shows the heading, it replaces the filter's heading, although both agree.
+    """
+    own, generator = SUITE.magnetometer.hard_iron_sigma, np.random.default_rng(4)
+    rules = compared(0.0, **({"sigma": 0.2} | changes))
+    iron = int(rules.settings["aid_vector"][0, Aid.MAGNETOMETER])
+    M = generator.normal(size=(3, 3))
+    rest = M @ M.T
+    rest *= left * own**2 / np.linalg.eigvalsh(rest)[-1]
+    covariance = rules.covariance()
+    here = np.arange(15 + iron, 18 + iron)
+    covariance[np.ix_(range(EIGHT), here, here)] = rest
+    rules.set_covariance(covariance)
+    for number, share in enumerate(np.repeat([0.99, 1.01], 4)):
+        b = generator.normal(size=3)
+        b *= 5.0 * share / math.sqrt(b @ np.linalg.solve(1.1 * own**2 * np.eye(3) - rest, b))
+        slow = rules.get("slow_hat")[number]
+        slow[iron : iron + 3] = b
+        rules.put(number, slow_hat=slow)
+    rules.set(level_against=2.0)
+    rules.run(Stage.HEADING)
+    found = np.repeat([0.0, 1.0], 4) if not changes else changes.get("compass_out", 0.0)
+    np.testing.assert_array_equal(rules.get("compass_out"), found)
+    np.testing.assert_array_equal(rules.get("heading_lost"), 0.0)
+    if not changes:
+        sigma = np.sqrt(rules.covariance()[:, 8, 8])
+        np.testing.assert_allclose(sigma, np.repeat([0.02, 0.2], 4), rtol=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.0, 10.0])

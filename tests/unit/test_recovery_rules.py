@@ -259,19 +259,24 @@ def test_reset_to_a_barometer_and_a_compass_alone_adds_their_own_errors():
 def test_reset_to_a_compass_explains_its_fields_by_hard_iron_where_others_show_the_heading(
     confirmed, size
 ):
-    """The iron is as large as the innovation, or as usual; alone, it is usual in any case."""
+    """The iron is as large as the innovation, or as usual.
+
+    Alone, it is as large as the part of the innovation that no heading explains.
+    """
     rules = LaneRules(ALL)
     iron = 15 + int(rules.settings["aid_vector"][0, Aid.MAGNETOMETER])
     for row in range(iron, iron + 3):
         rules.set_sigma(row, 1e-9)
-    refused(rules, "magnetometer", nu=(0.0, 0.6 * size, -0.8 * size))
+    nu = np.array([0.0, 0.6 * size, -0.8 * size])
+    refused(rules, "magnetometer", nu=nu)
     if confirmed:
         rules.change("accepted_tick", PIXELS, NOW)
     rules.run(Stage.RECOVER)
     np.testing.assert_array_equal(reset_counts(rules, "magnetometer"), 1.0)
-    own = ALL.magnetometer.hard_iron_sigma
+    own, field = ALL.magnetometer.hard_iron_sigma, np.array(ALL.magnetometer.field_I)
+    other = math.hypot(math.hypot(*(field + nu)[:2]) - math.hypot(*field[:2]), nu[2])
     found = np.sqrt(variances(rules))
-    np.testing.assert_allclose(found[iron : iron + 3], max(own, size) if confirmed else own)
+    np.testing.assert_allclose(found[iron : iron + 3], max(own, size if confirmed else other))
     heading = math.hypot(size, own) / math.hypot(*ALL.magnetometer.field_I[:2])
     assert found[8] == pytest.approx(0.05 if confirmed else max(heading, 0.05))
 

@@ -129,6 +129,25 @@ def test_compass_refused_for_long_resets_the_heading_unless_the_motion_contradic
     assert kf.covariance[8, 8] == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize("off", [(0.0, 0.0, -2e-5), (0.0, 3e-5, 0.0), (0.0, 0.0, 0.0)])
+def test_reset_to_a_compass_gives_hard_iron_the_variance_that_no_heading_explains(off):
+    """No heading explains another vertical part or another length of the level part."""
+    compass, turn, group = MAGNETIC.magnetometer, 0.5, AID_GROUPS + Aid.MAGNETOMETER
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = quad_gym.UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    set_at_rest(kf, 1e-6 * np.eye(15))
+    refused_for_long(kf, group, stepped=False)
+    field = np.array(compass.field_I)
+    found = euler_to_dcm([0.0, 0.0, turn]) @ (field + off)
+    kf.update(magnetometer=found)
+    assert kf._engine.read("resets")[0, group] == 1.0
+    longer = math.hypot(*found[:2]) - math.hypot(*field[:2])
+    expected = max(compass.hard_iron_sigma, math.hypot(longer, off[2]))
+    iron = int(kf._engine.settings["aid_vector"][0, Aid.MAGNETOMETER])
+    rows = kf._engine.read("P_slow")[0]
+    assert math.sqrt(rows[iron, 15 + iron]) == pytest.approx(expected, rel=1e-3)
+
+
 def test_measurement_after_a_reset_determines_the_state():
     ukf, off = started(DEVIATIONS), np.array([5.0, -3.0, 2.0])
     refuse(ukf, off, stepped=True)

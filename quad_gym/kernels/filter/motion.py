@@ -28,16 +28,21 @@ soon as u is known, and variances and limits are larger until then.
 N is leveled by the force that the change of velocity does not explain. Leveling by the whole force
 would follow a steady turn with a lag that looks like a heading. What leveling leaves is d.
 
-Where no baseline and no camera measures the heading, too, three rules compare the filter with it:
+Where no baseline and no camera measures the heading, too, four rules compare the filter with it:
 
 * **Support.** Where the headings agree, the heading counts as measured: a refused compass stays
   out. Both turn with the gyro. If the fields have left the gate gradually, its bias may have
   changed, so that u has the variance of a gyro that drifts: only fixes in motion confirm it then.
 * **Contradiction.** Where they differ by more than four standard deviations in three fixes in a
   row, attitude and heading become those of the motion. The compass is left out until it agrees.
+* **Hard iron.** GNSS turns the filter's heading toward that of the motion, but the filter's
+  variance still comes from the compass. The error of a wrong compass then appears as hard iron.
+  Where this exceeds five standard deviations of the suite in three fixes in a row, and the motion
+  shows the heading, the filter is reset as after a contradiction.
 * **Lean.** Where no motion has confirmed the heading, and the filter's vertical leaves that of N, a
   wrong heading has made it attribute changes of velocity to its tilt. Then the tilt becomes that of
-  N, and the heading counts as unknown until the motion shows it. Meanwhile no measurement of
+  N, and the heading counts as unknown until the motion shows it. A vertical that is off by more
+  than 8 degrees is reset at once, also between two fixes. Meanwhile no measurement of
   position or velocity corrects the attitude: a filter that linearizes about a heading that is wrong
   by more than a radian would turn the wrong way. A start without any heading begins like this.
 
@@ -125,6 +130,9 @@ _LEAST = 0.03  #: least square of one, and largest variance of the filter's head
 _LEAN, _MOST_LEAN, _LARGE_LEAN = 0.087, 0.12, 0.14
 """Angles between the verticals beyond which a tilt is wrong [rad]: at least and at most without a
 confirmed heading, and with one."""
+_IRON, _MORE_IRON = 25.0, 1.1
+"""Normalized square of an estimated hard iron beyond which the compass is wrong, and a factor on
+the variance at the start, so that no variance is zero."""
 _START = 0.06  #: standard deviation of a first tilt beyond which it may lean further [rad]
 _LEANS, _LEANS_IN_ROW = 12.0, 2.0
 """Ratio of its square and the variance of N's tilt between these, and times in a row."""
@@ -368,11 +376,38 @@ def _chosen(lanes, a, b):
 
 
 @kernel
+def _wrong_iron(flight, p, slow):
+    """Lanes in which the estimated hard iron is too large for the suite.
+
+    In a consistent filter, the variances of an estimate and of its error add up to the variance at
+    the start.
+    """
+    none = no_lane(p.dt)
+    if slow is None:
+        return none
+    iron = slow.aid_vector[_MAGNETOMETER]
+    if iron < 0:
+        return none
+    sigma = maximum(p.slow_sigma[iron], 1e-12)
+    scale, own = 1.0 / (sigma * sigma), flight.P_slow[:, D:]
+    b, rest = load3(flight.slow_hat[iron : iron + 3]), scale * load_symmetric(own, iron)
+    one = zero_like(p.dt) + _MORE_IRON
+    x, y, z = diagonal((one, one, one)) - rest
+    across, determinant = cross(y, z), dot(x, cross(y, z))
+    least = minimum(x[0], minimum(y[1], z[2]))
+    nis = dot(b, across) * b[0] + dot(b, cross(z, x)) * b[1] + dot(b, cross(x, y)) * b[2]
+    proper = (least > 0.0) & (determinant > 1e-4)
+    return proper & (scale * nis > _IRON * determinant) & (flight.compass_out <= 0.0)
+
+
+@kernel
 def _judge_heading(flight, p, work, settings, stages, slow):
     """Compare the filter's attitude with that of the motion, and reset it where they contradict."""
-    if not any_of(flight.level_fresh > 0.0):
-        return
     fresh, R_BI = flight.level_fresh > 0.0, load33(flight.R_hat)
+    lean = R_BI.T[2] - load33(flight.level_turn).T[2]
+    far = (dot(lean, lean) > _LARGE_LEAN * _LARGE_LEAN) & (flight.level_phase > 1.0)
+    if not any_of(fresh | far):
+        return
     W, first = _uprighted(flight, p)
     flight.level_fresh = zero_like(p.dt)
     x, M, k = flight.level_state, R_BI.T @ W, R_BI.T[2]
@@ -393,7 +428,8 @@ def _judge_heading(flight, p, work, settings, stages, slow):
         ruled = no_lane(p.dt)
     holds = holds & (variance < _ROUGH * _ROUGH) & ruled
     both = variance + minimum(own, _LEAST)
-    against = holds & (apart > maximum(_AGAINST * both, _LEAST))
+    iron = known & ruled & _wrong_iron(flight, p, slow)
+    against = iron | (holds & (apart > maximum(_AGAINST * both, _LEAST)))
     doubts = holds & (apart > maximum(_DOUBT * both, _LEAST))
     agrees = known & ruled & (apart <= maximum(_AGREES * both, _LEAST))
     flight.level_tick = select(agrees, flight.tick, flight.level_tick)
@@ -421,14 +457,14 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     # a large first tilt is only as well known as d and the filter say
     both = _AGAINST * (tilt + 0.5 * _tilt_of(flight))
     limit = select(flight.level_first > 0.0, maximum(limit, both), limit) + _LEANS * first
-    leans = fresh & (dot(lean, lean) > limit) & ruled
+    leans = (fresh | far) & (dot(lean, lean) > limit) & ruled
     leans = leans & (flight.level_phase > 1.0)
     row = select(fresh, select(leans, flight.level_lean + 1.0, 0.0), flight.level_lean)
-    far = maximum(limit, _LARGE_LEAN * _LARGE_LEAN)
-    row = select(leans & (dot(lean, lean) > far), _LEANS_IN_ROW, row)
+    least = maximum(limit, _LARGE_LEAN * _LARGE_LEAN)
+    row = select(leans & (dot(lean, lean) > least), _LEANS_IN_ROW, row)
     wrong = wrong | (leans & (row >= _LEANS_IN_ROW))
     flight.level_lean = select(wrong, 0.0, row)
-    certain = known & sharp
+    certain = known & (sharp | iron)
     loses, wrong = wrong & logical_not(certain), wrong & certain
     if any_of(wrong | found):
         turn = _turn_of(u[0] / length, u[1] / length)

@@ -188,10 +188,20 @@ def _expect(flight, p, work, settings, i, k, valid):
 
 @kernel
 def _reset(flight, p, work, settings, states, lanes, alone, nu):
-    """Reset hard iron; where no other sensor measures the heading, the heading, too."""
+    """Reset hard iron; where no other sensor measures the heading, the heading, too.
+
+    An error of the heading changes neither the vertical part of the field nor the length of its
+    level part. Hard iron gets a variance for these changes: otherwise they would change the tilt.
+    """
     first, m, square = settings.aid_vector[_S], load3(p.aid_numbers[_N]), dot(nu, nu)
     own = p.slow_sigma[first] * p.slow_sigma[first]
-    iron = select(alone, own, maximum(own, square))
+    expected, _ = _expected_field(flight, p, settings)
+    R_BI = load33(flight.R_hat)
+    f, found = R_BI.T @ expected, R_BI.T @ (expected + nu)
+    longer = math.sqrt(found[0] * found[0] + found[1] * found[1])
+    longer = longer - math.sqrt(f[0] * f[0] + f[1] * f[1])
+    other = longer * longer + (found[2] - f[2]) * (found[2] - f[2])
+    iron = maximum(own, select(alone, other, square))
     reset_variances(work.P, D + first, states, lanes, (iron, iron, iron))
     variance = (square + own) / (m[0] * m[0] + m[1] * m[1])
     reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
