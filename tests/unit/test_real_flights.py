@@ -78,6 +78,7 @@ def test_command_with_a_wrong_suite_ends_with_a_sentence_and_exit_code_1(flight,
     ended = run("replay", "flight.csv", *options, where=tmp_path)
     assert ended.returncode == 1
     cause = "does not fit this log|dead reckoning|does not explain|a correlation of 0.9"
+    cause += "|contradicts the GNSS velocities|run apart"
     pattern = rf"Not usable, because .*({cause})|no measurement"
     assert re.search(pattern, ended.stdout + ended.stderr)
 
