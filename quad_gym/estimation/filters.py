@@ -179,8 +179,9 @@ class FilterEstimate:
     def nis(self) -> tuple[float, int]:
         """Normalized innovation squared of the last update, and its degrees of freedom.
 
-        The suite's noise applies, and directions count across themselves, with two numbers. NaN:
-        the update was done in steps.
+        The suite's noise applies, and directions count across themselves, with two numbers. Where
+        the gate has weakened directions so far off that their joint NIS is inexact, it is the sum
+        of those in `block_nis`. NaN: the update was done in steps.
 
         With delayed measurements, the last update is the one with the latest time stamp.
         """

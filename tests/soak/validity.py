@@ -54,8 +54,6 @@ def assert_failures_are_reported(batch, failures, nis):
     made, accepted = measured.any(axis=1), (measured & used).any(axis=1)
     failed = counted[0] > failures[0]
     known = np.isfinite(now) & np.isfinite(nis)  # no NIS for an image processed in steps
-    weakened = (measured & (gate == GateDecision.WEAKENED)).any(axis=1)
-    known &= (now != 0.0) | ~weakened  # of weakened features it may be 0
     np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
     np.testing.assert_array_equal((measured & (gate == GateDecision.FAILED)).any(axis=1), failed)
     return made, int((made & ~accepted & ~failed).sum()), counted, now

@@ -367,6 +367,44 @@ def test_feature_whose_direction_is_too_uncertain_is_left_out_and_counts_as_noth
     np.testing.assert_array_equal(rules.get("nis_ratio") == 1.0, unsure)
 
 
+def seen_turned(rules, turns, count):
+    """Measure the first features, at pixels turned about an axis of the picture, (EIGHT,) [rad].
+
+    They have been rejected before, so that they are weakened. Returns the pixels of the first one.
+    """
+    for i, feature in reversed(list(enumerate(np.array(CAMERA.features_I)[:count]))):
+        along = euler_to_dcm(CAMERA.attitude) @ feature
+        along /= np.linalg.norm(along)
+        side = np.cross(along, (0.0, 1.0, 0.0))
+        seen = np.outer(np.cos(turns), along) + np.outer(np.sin(turns), side / np.linalg.norm(side))
+        pixels = CAMERA.focal_length * seen / seen[:, 2:]
+        rules.measured(FEATURE_BLOCKS + i, pixels * (1.0, 1.0, 0.0))
+    rules.change("rejected_in_row", FEATURE_GROUP, 2.0)
+    rules.run(Stage.UPDATE)
+    return pixels[:, :2]
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.005, 0.02])
+@pytest.mark.parametrize("count", [1, 2])
+def test_nis_of_features_far_off_is_not_below_the_mean_of_its_parts(sigma, count):
+    """The joint NIS of Gaussian numbers is not below that of some of them, nor below their mean.
+
+    Of the first feature, on the camera's axis, it is the square of the sine over the variance of
+    the attitude and of a pixel.
+    """
+    rules, turns = looking(sigma), np.linspace(0.1, 0.8, EIGHT)
+    pixels = seen_turned(rules, turns, count)
+    blocks = slice(FEATURE_BLOCKS, FEATURE_BLOCKS + count)
+    assert (rules.get("gate")[1:, blocks] == WEAKENED).all()
+    S = sigma**2 + CAMERA.pixel_sigma**2 / ((pixels**2).sum(axis=1) + CAMERA.focal_length**2)
+    nis, single = rules.get("nis"), rules.get("block_nis")[:, blocks]
+    np.testing.assert_allclose(single[:, 0], np.sin(turns) ** 2 / S, rtol=0.01)
+    assert (nis > 0.9 * single.sum(axis=1) / (2.0 * count)).all()
+    assert (nis < 1.01 * single.sum(axis=1)).all()
+    if count == 1:
+        np.testing.assert_allclose(nis, single[:, 0], rtol=0.01)
+
+
 # --------------------------------------------------------------------------------------------------
 # A new episode.
 # --------------------------------------------------------------------------------------------------

@@ -77,6 +77,9 @@ from quad_gym.kernels.numbers.rotation import (
 )
 from quad_gym.records import Act, FilterForm
 
+_LEAST_SHARE = 0.9
+"""Share of the blocks' NIS per degree of freedom below which the joint NIS is inexact."""
+
 
 @kernel
 def _split_turns(work, c, form):
@@ -328,7 +331,10 @@ def _update_by(flight, p, work, settings, stages, n, mask, steps, pivot, slow):
     _keep(flight, p, work, form, states, columns, ok, slow)
     nis = maximum(nis - along, 0.0)  # a difference of rounding errors where it is zero
     if (form & FilterForm.GATE.value) != 0:
-        nis = select(work.used_nis > 0.0, nis * work.suite_nis / work.used_nis, nis)
+        # a joint NIS is at least the mean of its parts; along directions far off, it is inexact
+        known = nis * (measured - without) > _LEAST_SHARE * work.used_nis
+        weighed = select(known, nis * work.suite_nis / work.used_nis, work.suite_nis)
+        nis = select(work.used_nis > 0.0, weighed, nis)
     flight.nis = select(ok, nis, flight.nis)
     flight.nis_dimension = select(ok, measured - without, flight.nis_dimension)
     failed = wanted & logical_not(ok)
