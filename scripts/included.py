@@ -99,4 +99,5 @@ def main(args: IncludedArgs) -> None:
 
 
 if __name__ == "__main__":
-    main(options.parse(IncludedArgs, prog="python -m scripts.included", description=__doc__))
+    with options.quiet_end():
+        main(options.parse(IncludedArgs, prog="python -m scripts.included", description=__doc__))

@@ -50,7 +50,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_gym.commands.options import parse, require_at_least, usage_errors
+from quad_gym.commands.options import parse, quiet_end, require_at_least, usage_errors
 from quad_gym.params import checks as check
 
 ROOT = Path(__file__).parents[1]
@@ -563,4 +563,5 @@ def main(args: MutantsArgs) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(MutantsArgs))
+    with quiet_end():
+        main(parse(MutantsArgs))

@@ -1,14 +1,13 @@
 """`quad-gym COMMAND`: subcommands of tyro, of which only the one that runs is imported."""
 
 import importlib
-import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Union, get_type_hints
 
 from tyro.conf import subcommand
 
-from quad_gym.commands.options import USAGE_ERROR, parse, with_plain_help
+from quad_gym.commands.options import USAGE_ERROR, parse, quiet_end, with_plain_help
 
 COMMANDS = {
     "circle": "reproduce the report's experiment over many seeds: tables and figures",
@@ -29,8 +28,7 @@ COMMANDS = {
 }
 """Commands, of one or two words, and their descriptions."""
 
-INTERRUPTED, CLOSED_PIPE = 130, 141
-"""Exit codes of programs that Ctrl-C or a closed pipe has stopped."""
+INTERRUPTED = 130  #: exit code of a program that Ctrl-C has stopped
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,14 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        try:
+        with quiet_end():
             args = parsed(words)
             return sys.modules[type(args).__module__].main(args) or 0
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:  # the reader has gone, such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return CLOSED_PIPE
     except (KeyboardInterrupt, Exception) as error:
         from quad_gym.kernels.library import NoKernelsError
 

@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import io
 import itertools
+import os
 import re
 import shutil
 import sys
@@ -39,6 +40,7 @@ OBSERVATION, SENSORS, WORLD = (DEFAULTS[name] for name in ("observation", "senso
 """Defaults of options that are keywords of environments."""
 
 USAGE_ERROR = 2  #: exit code of a program that was called with invalid options
+CLOSED_PIPE = 141  #: exit code of a program whose output has lost its reader
 
 _REGISTRY = ConstructorRegistry()
 
@@ -212,6 +214,22 @@ def usage_errors(
             message = f"{error.filename}{' does not exist' if missing else f': {error.strerror}'}"
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
+
+
+@contextmanager
+def quiet_end() -> Iterator[None]:
+    """Context that ends a program without a traceback if the reader of its output, as head, ends.
+
+    The exit code is `CLOSED_PIPE`.
+    """
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        raise SystemExit(CLOSED_PIPE) from None
 
 
 @contextmanager

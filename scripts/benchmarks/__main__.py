@@ -17,7 +17,7 @@ from tyro.conf import Positional
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.own_estimator import Estimator
 from quad_gym.commands.benchmark import BenchmarkArgs, run_sections
-from quad_gym.commands.options import SuiteNames, parse, require_at_least, usage_errors
+from quad_gym.commands.options import SuiteNames, parse, quiet_end, require_at_least, usage_errors
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH
@@ -95,4 +95,5 @@ def main(args: PartsArgs) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(PartsArgs, prog="python -m scripts.benchmarks", description=__doc__))
+    with quiet_end():
+        main(parse(PartsArgs, prog="python -m scripts.benchmarks", description=__doc__))

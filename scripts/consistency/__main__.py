@@ -25,7 +25,14 @@ from quad_gym import sensor_suite
 from quad_gym.analysis.consistency import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
 from quad_gym.commands.consistency import CaseFlights
-from quad_gym.commands.options import SuiteName, Threads, parse, require_at_least, usage_errors
+from quad_gym.commands.options import (
+    SuiteName,
+    Threads,
+    parse,
+    quiet_end,
+    require_at_least,
+    usage_errors,
+)
 from scripts.consistency import ablation, causes, matrix, recovery
 from scripts.consistency.tables import run_cases, unexpected
 
@@ -115,4 +122,5 @@ def _ablate(args: TableArgs, flights: CaseFlights) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(TableArgs, prog="python -m scripts.consistency", description=__doc__))
+    with quiet_end():
+        main(parse(TableArgs, prog="python -m scripts.consistency", description=__doc__))

@@ -12,6 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from quad_gym.commands.options import quiet_end
 from scripts.estimate_bench import entries
 from scripts.estimate_bench.table import ENTRIES, texts
 from scripts.studies.campaign import EPISODES, FIRST_EPISODE
@@ -76,4 +77,5 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with quiet_end():
+        sys.exit(main())

@@ -152,13 +152,21 @@ def main(args: StudyArgs) -> None:
     )
 
 
-if __name__ == "__main__":
-    if sys.argv[1:2] in (["run"], ["again"]):
-        from scripts.studies import again, run
+def run(words: list[str]) -> int:
+    """Run the study, or the program that the first word names; return the exit code."""
+    if words[:1] not in (["run"], ["again"]):
+        main(options.parse(StudyArgs, words, prog="python -m scripts.studies", description=__doc__))
+        return 0
+    from scripts.studies import again
+    from scripts.studies import run as campaign
 
-        program: Any = {"run": run, "again": again}[sys.argv[1]]
-        kind = {"run": run.RunArgs, "again": again.AgainArgs}[sys.argv[1]]
-        prog = f"python -m scripts.studies {sys.argv[1]}"
-        words = options.parse(kind, sys.argv[2:], prog=prog, description=program.__doc__)
-        sys.exit(program.main(words))
-    main(options.parse(StudyArgs, prog="python -m scripts.studies", description=__doc__))
+    program: Any = {"run": campaign, "again": again}[words[0]]
+    kind = {"run": campaign.RunArgs, "again": again.AgainArgs}[words[0]]
+    prog = f"python -m scripts.studies {words[0]}"
+    chosen = options.parse(kind, words[1:], prog=prog, description=program.__doc__)
+    return int(program.main(chosen) or 0)
+
+
+if __name__ == "__main__":
+    with options.quiet_end():
+        sys.exit(run(sys.argv[1:]))

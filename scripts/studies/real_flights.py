@@ -165,4 +165,5 @@ def main(args: RealFlightsArgs) -> None:
 
 if __name__ == "__main__":
     program = "python -m scripts.studies.real_flights"
-    main(options.parse(RealFlightsArgs, prog=program, description=__doc__))
+    with options.quiet_end():
+        main(options.parse(RealFlightsArgs, prog=program, description=__doc__))

@@ -231,8 +231,9 @@ def test_other_errors_are_raised(monkeypatch):
         main(["circle"])
 
 
-def test_a_closed_pipe_ends_a_command_quietly():
-    line = [sys.executable, "-m", "quad_gym", "circle", "--help"]
+@pytest.mark.parametrize("program", ["quad_gym circle", "scripts.studies", "tests.soak"])
+def test_a_closed_pipe_ends_a_command_quietly(program):
+    line = [sys.executable, "-m", *program.split(), "--help"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""

@@ -21,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from quad_gym.commands.options import parse, require_at_least
+from quad_gym.commands.options import parse, quiet_end, require_at_least
 from quad_gym.params import checks as check
 from tests.soak import log
 from tests.soak.cases import generator
@@ -97,4 +97,5 @@ def sentence(row: log.Row) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(parse(SoakArgs, prog="python -m tests.soak", description=ABOUT)))
+    with quiet_end():
+        sys.exit(main(parse(SoakArgs, prog="python -m tests.soak", description=ABOUT)))
