@@ -274,6 +274,19 @@ def test_log_whose_topic_lacks_a_field_is_read_without_it(flight, tmp_path):
     has(log.notes, "vehicle_gps_position", "no fix")
 
 
+def test_damage_of_a_ulog_is_a_note_and_not_printed(flight, tmp_path, capfd):
+    pytest.importorskip("pyulog")
+    file = tmp_path / "flight.ulg"
+    foreign.write_px4(file, flight)
+    whole = file.read_bytes()
+    assert not any("damaged" in note for note in read_log(file).notes)
+    file.write_bytes(whole[:20_000] + bytes(40) + whole[20_000:])
+    log = read_log(file)
+    assert len(log.imu) > 0.5 * len(flight.time)
+    has(log.notes, "damaged parts of the file")
+    assert capfd.readouterr() == ("", "")
+
+
 # ---- ROS -----------------------------------------------------------------------------------------
 
 

@@ -29,7 +29,9 @@ mean sea level are used.
 Source: the PX4 user guide, "ULog File Format" and the definitions of these messages.
 """
 
+import io
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +84,8 @@ def read_ulog(path: Path | str) -> RawLog:
     with reading(path, "a ULog", "logs of PX4", "pyulog", "ulog") as file:
         from pyulog import ULog
 
-        ulog = ULog(str(file))
+        with redirect_stdout(io.StringIO()) as printed:  # the library's messages about damage
+            ulog = ULog(str(file))
         topics: dict[str, dict[int, _Topic]] = {}
         for data in ulog.data_list:
             if len(data.data["timestamp"]):
@@ -94,6 +97,7 @@ def read_ulog(path: Path | str) -> RawLog:
         file=file.name,
         sources=[*_inertial(topics), *_gnss(topics, parameters), *_aids(topics, parameters)],
         barometer_from_start=True,
+        notes=["damaged parts of the file are left out"] if printed.getvalue() else [],
     )
 
 
