@@ -42,7 +42,7 @@ def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArr
 def time_filter(scope: Scope) -> list[benchmark.Row]:
     """Time cycles of update and prediction on one core.
 
-    A run of a filter for one vehicle makes the filter, too, which counts among its few cycles.
+    A run of a filter for one vehicle starts it, too. Making the filter is not timed.
     """
     rows: list[benchmark.Row] = []
     count, effort, recorded_ticks = scope.batch, scope.effort, 5 if scope.quick else 40

@@ -36,7 +36,7 @@ class MeasuredTick(NamedTuple):
 
 
 Run = Callable[[], list[Estimate]]
-"""Function that runs a filter over a flight; the estimates after each update."""
+"""Function that starts a filter, made before, for a flight; the estimates after each update."""
 
 
 def load_reference() -> ModuleType | None:
@@ -77,8 +77,10 @@ def _cycles(
     sensors: SensorSuite,
     flight: list[MeasuredTick],
 ) -> Run:
+    ukf = kind(sensors)
+
     def run() -> list[Estimate]:
-        ukf, found = kind(sensors), list[Estimate]()
+        found = list[Estimate]()
         ukf.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
         for now in flight:
             ukf.update(now.gnss_position_G, now.gnss_baseline_G, now.pixels)
@@ -131,11 +133,12 @@ def _filterpy_cycles(
             noise.append(plain._direction_noise(across, variance))
         return np.concatenate(z), module.block_diagonal(*noise)
 
+    points = kalman.MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
+    ukf = kalman.UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
+
     def run() -> list[Estimate]:
         found = list[Estimate]()
         plain.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
-        points = kalman.MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
-        ukf = kalman.UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
         ukf.x, ukf.P, R = plain._state(), plain.P.copy(), plain.R
         spread = np.zeros((15, 12))  # from the noises (gyro, gyro bias, accel, accel bias)
         spread[0:3, 6:9], spread[3:6, 6:9] = -(dt**2) / 2 * R.T, -dt * R.T

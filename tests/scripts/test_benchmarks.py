@@ -3,6 +3,7 @@
 import json
 import subprocess
 
+import numpy as np
 import pytest
 
 import quad_gym
@@ -12,7 +13,8 @@ from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
 from scripts.benchmarks import __main__ as script
-from scripts.benchmarks import learning, precision, stages
+from scripts.benchmarks import learning, peers, precision, stages
+from scripts.benchmarks.filter import record_one
 
 
 def run(folder, *options):
@@ -81,6 +83,24 @@ def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_p
     for row in (plain, *others):
         assert row["position"] == pytest.approx(ours["position"], rel=0.01)
         assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
+
+
+def test_making_a_filter_is_not_timed_and_a_run_can_be_repeated(monkeypatch):
+    made, sensors = [], quad_gym.sensor_suite("lab").replace(camera=None)
+
+    class Counted(peers.UnscentedKalmanFilter):
+        def __init__(self, suite):
+            made.append(suite)
+            super().__init__(suite)
+
+    monkeypatch.setattr(peers, "UnscentedKalmanFilter", Counted)
+    flight = record_one(hovering(WIDTH, sensors=sensors), 0, 20)
+    for name, cycles in peers.peers(sensors, flight).items():
+        first, second = cycles(), cycles()
+        for one, other in zip(first, second, strict=True):
+            np.testing.assert_array_equal(one.position, other.position, err_msg=name)
+            np.testing.assert_array_equal(one.R_BI, other.R_BI, err_msg=name)
+    assert len(made) == 1
 
 
 def test_precision_section_compares_processes_in_both_precisions(tmp_path, monkeypatch, capsys):
