@@ -119,12 +119,12 @@ def damaged_bytes(rng, content):
 # --------------------------------------------------------------------------------------------------
 
 
-def damaged_table(rng, rows):
-    """Damage a table, once or a few times."""
+def damaged_table(rng, rows, damages):
+    """Damage a table by some of `damages`, once or a few times."""
     first = int(rng.integers(0, max(1, len(rows) // 2)))
     head, body = list(rows[0]), [list(row) for row in rows[1 + first : 1 + first + 2000]]
     for _ in range(int(rng.integers(1, 3))):
-        head, body = pick(rng, DAMAGES)(rng, head, body)
+        head, body = pick(rng, damages)(rng, head, body)
         if not body or not head:
             break
     return [head, *body]
@@ -236,6 +236,45 @@ def ragged_rows(rng, head, body):
     return head, body
 
 
+def lost_stretch(rng, head, body):
+    """Remove rows of at most two seconds or so, as where a card was slow."""
+    at = int(rng.integers(len(body)))
+    return head, body[:at] + body[at + int(rng.integers(1, 200)) :]
+
+
+def noisy_column(rng, head, body):
+    """Add noise to the numbers of a column other than the times, of up to their size."""
+    if len(head) < 2:
+        return head, body
+    k, share = int(rng.integers(1, len(head))), log_uniform(rng, 1e-3, 1.0)
+    for row in body[_span(rng, len(body))]:
+        if k < len(row):
+            row[k] = _times(row[k], 1.0 + share * float(rng.normal()))
+    return head, body
+
+
+def repeated_stamps(rng, head, body):
+    """Give a few rows the time of the row before, as a clock of low resolution does."""
+    for i in rng.integers(1, len(body), int(rng.integers(1, 6))) if len(body) > 1 else ():
+        if body[i] and body[i - 1]:
+            body[i][0] = body[i - 1][0]
+    return head, body
+
+
+def other_unit(rng, head, body):
+    """Write a column other than the times in another unit, from the first row to the last."""
+    if len(head) < 2:
+        return head, body
+    k = int(rng.integers(1, len(head)))
+    factor = pick(rng, (180.0 / math.pi, math.pi / 180.0, 9.81, 1.0 / 9.81, 100.0, 0.01, -1.0))
+    for row in body:
+        if k < len(row):
+            row[k] = _times(row[k], factor)
+    return head, body
+
+
+MILD = (lost_stretch, noisy_column, repeated_stamps, other_unit)
+"""Damages with which most logs are read."""
 DAMAGES = (
     remove_column,
     double_column,
@@ -260,7 +299,7 @@ DAMAGES = (
 
 def written(rng, folder):
     """Write a damaged log into a folder; return its path, and options of the reader."""
-    name = pick(rng, sorted(sound()))
+    name = pick(rng, [path.name for path in TABLES] if chance(rng, 0.5) else sorted(sound()))
     content, options = sound()[name], {}
     path = folder / name
     if name == MAPPED and chance(rng, 0.9):
@@ -268,7 +307,8 @@ def written(rng, folder):
     if name.endswith(".csv.gz") and chance(rng, 0.75):
         path = path.with_suffix("")
         with path.open("w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream).writerows(damaged_table(rng, table(name)))
+            damages = MILD if chance(rng, 0.7) else DAMAGES
+            csv.writer(stream).writerows(damaged_table(rng, table(name), damages))
     elif name.endswith(".csv.gz") and chance(rng, 0.5):
         path = path.with_suffix("")
         path.write_bytes(damaged_bytes(rng, gzip.decompress(content)[:300_000]))

@@ -1,5 +1,6 @@
 """The soak: one case of each kind passes, and planted differences, crashes and growth are found."""
 
+import contextlib
 import dataclasses
 import os
 
@@ -40,6 +41,21 @@ def test_a_case_passes_and_follows_from_its_number(name):
     assert failure(name, number) == ""
     draws = [generator(name, k).random() for k in (number, number, number + 1)]
     assert draws[0] == draws[1] != draws[2]
+
+
+def test_mild_damages_change_tables_that_are_still_read(tmp_path):
+    """Of each damage, most tables are read; none is unchanged, and the head stays."""
+    rows = damaged_logs.table("rtk_vertical.csv.gz")
+    for damage in damaged_logs.MILD:
+        read = 0
+        for number in range(4):
+            file = tmp_path / f"{damage.__name__}{number}.csv"
+            changed = damaged_logs.damaged_table(np.random.default_rng(number), rows, (damage,))
+            assert changed[0] == rows[0]
+            file.write_text("".join(",".join(row) + "\n" for row in changed), encoding="utf-8")
+            with contextlib.suppress(ValueError):
+                read += len(damaged_logs.read_log(file).imu) > 100
+        assert read >= 3, damage.__name__
 
 
 def test_a_bit_in_a_single_environment_is_found(monkeypatch):
