@@ -299,15 +299,17 @@ DAMAGES = (
 
 def written(rng, folder):
     """Write a damaged log into a folder; return its path, and options of the reader."""
-    name = pick(rng, [path.name for path in TABLES] if chance(rng, 0.5) else sorted(sound()))
+    name = pick(rng, [path.name for path in TABLES] if chance(rng, 0.6) else sorted(sound()))
     content, options = sound()[name], {}
     path = folder / name
     if name == MAPPED and chance(rng, 0.9):
-        options["columns"] = MAP
-    if name.endswith(".csv.gz") and chance(rng, 0.75):
+        options["columns"] = folder / MAP.name
+        shown = MAP.read_text(encoding="utf-8").partition("[attitude]")[0]  # the table has no more
+        options["columns"].write_text(shown, encoding="utf-8")
+    if name.endswith(".csv.gz") and chance(rng, 0.9):
         path = path.with_suffix("")
         with path.open("w", newline="", encoding="utf-8") as stream:
-            damages = MILD if chance(rng, 0.7) else DAMAGES
+            damages = MILD if chance(rng, 0.75) else DAMAGES
             csv.writer(stream).writerows(damaged_table(rng, table(name), damages))
     elif name.endswith(".csv.gz") and chance(rng, 0.5):
         path = path.with_suffix("")
