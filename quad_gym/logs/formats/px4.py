@@ -91,13 +91,14 @@ def read_ulog(path: Path | str) -> RawLog:
             if len(data.data["timestamp"]):
                 topics.setdefault(data.name, {})[data.multi_id] = _Fields(data.data)
         parameters = dict(ulog.initial_parameters)
+        damaged = ulog.file_corruption or bool(printed.getvalue())
     if "sensor_combined" not in topics:
         raise ValueError(f"{file.name} must have the topic sensor_combined, got {sorted(topics)}")
     return RawLog(
         file=file.name,
         sources=[*_inertial(topics), *_gnss(topics, parameters), *_aids(topics, parameters)],
         barometer_from_start=True,
-        notes=["damaged parts of the file are left out"] if printed.getvalue() else [],
+        notes=["damaged parts of the file are left out"] if damaged else [],
     )
 
 
