@@ -326,6 +326,10 @@ def test_policies_fly_other_episodes_and_are_compared_with_their_rows(small, cap
     assert sorted(map(str, again.read(run.DATA))) == sorted(
         str({**dict.fromkeys(again.COLUMNS), **row}) for row in rows
     )
+    policies = sum(row["seed"] is not None for row in rows)
+    said = again.texts(run.DATA)["studies.again"]
+    assert said.startswith(f"{policies} policies flew 5 other episodes ")
+    assert ("fixed rules" in said) == (policies < len(rows))
     wrong = {**rows[0], "crashed": 1.0 - rows[0]["crashed"]}
     (found,) = (c for c in again.compared([wrong], run.DATA) if c.column == "crashed")
     assert not found.within
