@@ -181,7 +181,8 @@ class FilterEstimate:
 
         The suite's noise applies, and directions count across themselves, with two numbers. Where
         the gate has weakened directions so far off that their joint NIS is inexact, it is the sum
-        of those in `block_nis`. NaN: the update was done in steps.
+        of those in `block_nis`. Without a gate, the NIS of such directions is too small, and may
+        be 0. NaN: the update was done in steps.
 
         With delayed measurements, the last update is the one with the latest time stamp.
         """
