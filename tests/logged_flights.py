@@ -47,9 +47,11 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
 
     keep_aids()
     for _ in range(round(seconds * rate)):
-        observation = env.step(policy.predict(observation)[0])[0]
+        observation, _, terminated, _, _ = env.step(policy.predict(observation)[0])
         recorder.keep()
         keep_aids()
+        if terminated:  # a crash, where the filter of a suite is poor
+            break
     recorder.flight.about.update(aids=np.array(aids), voltages=np.array(voltages))
     return recorder.flight
 

@@ -151,6 +151,8 @@ import warnings
 
 from analyses import analysis
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which jobs in the background ignore
+
 
 class Own:
     pass
