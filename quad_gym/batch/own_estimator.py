@@ -403,7 +403,7 @@ class OwnFilter:
         self.state.restore(snapshot)
         self.state.lock(False)
         for name in EXCHANGE_BLOCK.names or ():
-            put_in_flights(batch._exchange, name, batch.record(name))
+            batch._exchange[name] = batch._blocks[name]
         self._failed, self._has_covariance = False, True
 
     def run(self, batch: FlightMemory, command: Command) -> NDArray[np.float32]:

@@ -81,10 +81,11 @@ class ReadableBatch(FlightBatch):
     def restore(self, snapshot: NDArray[Any]) -> None:
         """Restore all flights from a snapshot."""
         super().restore(snapshot)
-        flights = self._blocks.copy()
+        flights, exchange = self._blocks.copy(), self._exchange.copy()
         self._resets[:] = 0
         self._run(Command.RESET)  # resets no flight, but computes `shown` and the observations
-        self._blocks[:] = flights  # padding lanes of the last block have begun again
+        # padding lanes of the last block have begun again
+        self._blocks[:], self._exchange[:] = flights, exchange
         self.remember()  # the step before is unknown: no progress, no gate passed
 
     def _calls_of_threads(self) -> Calls:

@@ -485,3 +485,20 @@ def test_train_command_uses_own_estimator(named, tmp_path):
     assert done.returncode == 0, done.stderr
     plan = json.loads((tmp_path / "run" / "training.json").read_text())
     assert "complementary:Complementary" in json.dumps(plan)
+
+
+def test_restored_flights_have_every_bit_of_flights_with_another_history():
+    """Three flights leave lanes of a block empty, in which estimates must be restored, too."""
+
+    def made():
+        return vec_env("look_around", 3, sensors="standard", estimator=Simple)
+
+    env, other = made(), made()
+    env.reset(seed=1)
+    other.reset(seed=2)
+    other.step(np.zeros((3, 4), np.float32))
+    kept = env.flights.batch.snapshot()
+    other.flights.batch.restore(kept)
+    for flown in (env, other):
+        flown.step(np.zeros((3, 4), np.float32))
+    assert other.flights.batch.snapshot().tobytes() == env.flights.batch.snapshot().tobytes()
