@@ -158,7 +158,7 @@ CATALOG = {
         ),
         Result(
             name="compass",
-            commands=["scripts.consistency.compass"],
+            commands=["scripts.consistency compass --episodes 256 --output OUT"],
             flights=("fault magnetometer_*", "RandomTrajectory, consumer", "Circle, consumer"),
             texts=texts.compass,
         ),

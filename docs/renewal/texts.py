@@ -294,9 +294,29 @@ def causes(folder: Path, _: Sequence[str]) -> dict[str, str]:
     return shares | {"causes": table(heads, rows)}
 
 
-def compass(_: Path, printed: Sequence[str]) -> dict[str, str]:
-    """Flights with a wrong compass."""
-    return {"compass": f"\n\n{printed[0].strip()}\n\n"}
+_OF_COMPASSES = (("in_use", 1), ("without", 2))  #: columns of flights with a compass, and digits
+
+
+def compass(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """Flights with a wrong compass, as a table."""
+    cells = _read(folder / "0/compass.json")["cells"]
+    rows = []
+    for label, cell in cells.items():
+        values, (suite, task, what) = cell["values"], label.split(", ", 2)
+        used = [f"{values[n]:.{k}f}" if n in values else "" for n, k in _OF_COMPASSES]
+        nees = f"{values['nees']:.2f} ± {values['standard_error']:.2f}"
+        tilt = f"{values['tilted']:.1f}", f"{values['worst_tilt']:.1f}"
+        rows.append([f"`{suite}`, {task}", what, nees, *used, *tilt])
+    heads = (
+        "suite, task",
+        "compass",
+        "NEES per state",
+        "compass in use after 10 s [%]",
+        "NEES where it is not",
+        "tilt off by more than 10 degrees [%]",
+        "largest tilt error [deg]",
+    )
+    return {"compass": table(heads, rows)}
 
 
 def _limits(shares: Sequence[float]) -> str:

@@ -70,15 +70,18 @@ NEGLIGIBLE_CORRELATION = 0.02
 Floats = NDArray[np.float64]
 
 
-def flight_errors(batch: FlightBatch) -> Floats:
-    """Errors of a batch's filters in the coordinates of their covariances, (count, 15)."""
+def flight_errors(batch: FlightBatch, *, rotation_vector: bool = False) -> Floats:
+    """Errors of a batch's filters in the coordinates of their covariances, (count, 15).
+
+    With `rotation_vector`, those of the attitude are rotation vectors in every suite.
+    """
     truth = {name: batch.record(field) for name, field in FIELDS.items()}
     estimate = {name: batch.record(f"{field}_hat") for name, field in FIELDS.items()}
     R_BI, R_hat = quaternion_to_dcm(batch.record("q")), batch.record("R_hat")
     return state_error(
         truth | {"R_BI": R_BI},
         estimate | {"R_BI": R_hat},
-        rotation_vector=batch.sensors.flow_alone,
+        rotation_vector=rotation_vector or batch.sensors.flow_alone,
     )
 
 

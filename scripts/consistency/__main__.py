@@ -3,6 +3,7 @@
     python -m scripts.consistency matrix      every suite on every task, and other conditions
     python -m scripts.consistency recovery    every suite with every fault that it can have
     python -m scripts.consistency causes      causes of failures that are not detected, and remedies
+    python -m scripts.consistency compass     filters whose compass is wrong from the start
     python -m scripts.consistency filters     UKF and EKF, and the UKF without each correction
     python -m scripts.consistency models      true vehicle, world and sensors that differ
 
@@ -10,7 +11,7 @@ The matrix has means of the normalized squares of errors and innovations (NEES, 
 from a warm start, and on one task with faults, latencies, mountings, randomization, random starts
 and wind; --cells suites leaves these out. The recovery shows how many filters are consistent 10 s
 after a fault, how many flag their divergence, and the rate of false alarms. The causes are of
-filters that do neither. An interrupted run of these three continues when it is started again.
+filters that do neither. An interrupted run of these four continues when it is started again.
 Filters and models fly the same seeds, and show NEES and errors.
 """
 
@@ -33,10 +34,15 @@ from quad_gym.commands.options import (
     require_at_least,
     usage_errors,
 )
-from scripts.consistency import ablation, causes, matrix, recovery
+from scripts.consistency import ablation, causes, compass, matrix, recovery
 from scripts.consistency.tables import run_cases, unexpected
 
-RESUMED: dict[str, Any] = {"matrix": matrix, "recovery": recovery, "causes": causes}
+RESUMED: dict[str, Any] = {
+    "matrix": matrix,
+    "recovery": recovery,
+    "causes": causes,
+    "compass": compass,
+}
 """Modules of the tables whose runs continue when they are started again."""
 
 
@@ -44,7 +50,7 @@ RESUMED: dict[str, Any] = {"matrix": matrix, "recovery": recovery, "causes": cau
 class TableArgs:
     """Options of the tables."""
 
-    table: Positional[Literal["matrix", "recovery", "causes", "filters", "models"]]
+    table: Positional[Literal["matrix", "recovery", "causes", "compass", "filters", "models"]]
     """table to compute"""
     episodes: int | None = None
     """number of flights in each case; defaults to 400, or 1000 for filters and models"""
@@ -90,7 +96,7 @@ def main(args: TableArgs) -> None:
 def _fly_cells(args: TableArgs, flights: CaseFlights) -> None:
     table = RESUMED[args.table]
     cases = matrix.cases_of(args.cells) if table is matrix else table.cases()
-    head = {"duration": args.duration} if table is matrix else {}
+    head = {"duration": args.duration} if table in (matrix, compass) else {}
     files = args.folder / args.table
     found = run_cases(cases, files, flights, table.measure, table.table_of, **head)
     print(f"{len(found)} cells, {unexpected(found)} unexpected misses; see {files}.md.")

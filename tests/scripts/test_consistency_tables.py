@@ -13,7 +13,7 @@ from quad_gym.commands.options import parse
 from quad_gym.faults import GnssJump, GyroBiasStep, PositionJump
 from quad_gym.params.suites import SUITES
 from scripts.consistency import __main__ as script
-from scripts.consistency import causes, evidence, matrix, recovery
+from scripts.consistency import causes, compass, evidence, matrix, recovery
 from scripts.consistency import tables as runs
 from scripts.consistency.recovered import (
     CONSISTENT,
@@ -22,7 +22,7 @@ from scripts.consistency.recovered import (
     measured_coordinates,
 )
 from scripts.consistency.tables import FLOWN, run_cases, vehicle_of
-from tests.field_flights import fly, nees
+from tests.field_flights import attitudes, fly, nees
 
 SMALL = CaseFlights(64, duration=1.0)
 
@@ -229,6 +229,29 @@ def test_recovery_table_is_written_with_misses_marked(tmp_path):
     assert "| *5.0* |" in text
     assert "| why" in text
     assert "| c | 0.2 | 0.0 | 6.0 |" in text
+
+
+@pytest.mark.parametrize("what", ["reversed", "none"])
+def test_compass_table_compares_filters_with_a_plain_computation(tmp_path, what):
+    (case,) = (c for c in compass.cases() if c.name == f"consumer, circle, {what}")
+    flights, how = CaseFlights(16, duration=5.0), (compass.measure, compass.table_of)
+    cell = run_cases([case], tmp_path / "compass", flights, *how)[case.name]
+    values, batch = cell["values"], case.batch(16)
+    batch.reset(seeds=range(16))
+    worst = np.zeros(16)
+    for step in range(1, 1 + round(5.0 * batch.sensors.imu.rate)):
+        batch.step()
+        if step % round(0.1 * batch.sensors.imu.rate) == 0:
+            true, found = attitudes(batch.record("q"))[:, :, 2], batch.record("R_hat")[:, :, 2]
+            worst = np.maximum(worst, np.arccos(np.clip((true * found).sum(axis=1), -1.0, 1.0)))
+    assert values["worst_tilt"] == pytest.approx(np.degrees(worst.max()), rel=1e-6)
+    assert values["tilted"] == pytest.approx(100.0 * np.mean(np.degrees(worst) > 10.0))
+    assert ("in_use" in values) == (what != "none")
+    if what != "none":
+        still = batch.record("compass_out") <= 0.0
+        assert values["in_use"] == pytest.approx(100.0 * still.mean())
+    assert (cell["misses"] == ["nees"]) == (values["nees"] > compass.MOST_NEES)
+    assert f"| {case.name} | " in (tmp_path / "compass.md").read_text()
 
 
 def tables(capsys, output, *options):
