@@ -179,8 +179,8 @@ def texts(folder: Path = DATA) -> dict[str, str]:
         worst = max(abs(one.rate - one.value) / one.sigma for one in rules)
         said += (
             f" Of {len(rules) // 2} fixed rules, {_share(rules)} rates do. These differ from their "
-            f"rows by at most {worst:.1f} standard deviations of a "
-            "difference between 300 and 1,000 episodes."
+            f"rows by at most {worst:.1f} standard deviations of a difference between "
+            f"{rows[0]['episodes']} and {EPISODES:,} episodes."
         )
     return {"studies.again": said}
 

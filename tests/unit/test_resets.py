@@ -113,14 +113,20 @@ def test_reset_to_a_baseline_cuts_the_covariances_of_the_heading_alone():
     assert_close(found, expected)
 
 
+def with_a_refused_compass():
+    """A filter at rest with one antenna, whose compass has been refused for long."""
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = quad_gym.UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    set_at_rest(kf, 1e-6 * np.eye(15))
+    refused_for_long(kf, AID_GROUPS + Aid.MAGNETOMETER, stepped=False)
+    return kf
+
+
 @pytest.mark.parametrize("against", [0.0, 1.0])
 def test_compass_refused_for_long_resets_the_heading_unless_the_motion_contradicts_it(against):
     """The variance is the square of the innovation and of hard iron, over the level field's."""
     compass, turn, group = MAGNETIC.magnetometer, 0.5, AID_GROUPS + Aid.MAGNETOMETER
-    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
-    kf = quad_gym.UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
-    set_at_rest(kf, 1e-6 * np.eye(15))
-    refused_for_long(kf, group, stepped=False)
+    kf = with_a_refused_compass()
     kf._engine.blocks["level_against"] = against
     kf.update(magnetometer=euler_to_dcm([0.0, 0.0, turn]) @ compass.field_I)
     assert kf._engine.read("resets")[0, group] == 1.0 - against
@@ -133,10 +139,7 @@ def test_compass_refused_for_long_resets_the_heading_unless_the_motion_contradic
 def test_reset_to_a_compass_gives_hard_iron_the_variance_that_no_heading_explains(off):
     """No heading explains another vertical part or another length of the level part."""
     compass, turn, group = MAGNETIC.magnetometer, 0.5, AID_GROUPS + Aid.MAGNETOMETER
-    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
-    kf = quad_gym.UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
-    set_at_rest(kf, 1e-6 * np.eye(15))
-    refused_for_long(kf, group, stepped=False)
+    kf = with_a_refused_compass()
     field = np.array(compass.field_I)
     found = euler_to_dcm([0.0, 0.0, turn]) @ (field + off)
     kf.update(magnetometer=found)
